@@ -1,0 +1,117 @@
+"""Image and mask files, resizing by a named filter, video. RGB, (height, width, 3), sRGB as stored."""
+
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from catacaustics.errors import UserError
+from catacaustics.files import atomic_path, write_bytes
+from catacaustics.shapes import Bool, Float, UInt8
+
+IMAGE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})
+
+RESIZE_FILTER = "area (cv2.INTER_AREA)"
+"""The filter of `resize`, named in every report: metrics at another filter cannot be compared."""
+
+
+def _decode(path: Path, flags_name: str) -> np.ndarray:
+    import cv2
+
+    try:
+        data = np.fromfile(path, np.uint8)
+    except FileNotFoundError as error:
+        raise UserError(f"There is no image {path}.", "an image file", "check the path, or restore the file") from error
+    image = cv2.imdecode(data, getattr(cv2, flags_name)) if data.size else None
+    if image is None:
+        size = "is empty (0 bytes)" if not data.size else f"cannot be decoded ({data.size} bytes)"
+        raise UserError(
+            f"The image {path} {size}.",
+            "a complete JPEG, PNG, TIFF, BMP or WebP file",
+            "copy the file again from its source, or delete it",
+        )
+    return image
+
+
+def read_image_bytes(path: Path) -> UInt8[np.ndarray, "height width 3"]:
+    """An image as 8-bit RGB, upright (EXIF orientation applied).
+
+    Raises:
+        UserError: the file is missing, empty or cannot be decoded.
+    """
+    return np.ascontiguousarray(_decode(path, "IMREAD_COLOR")[..., ::-1])
+
+
+def read_image(path: Path) -> Float[np.ndarray, "height width 3"]:
+    """An image as float32 RGB in [0, 1]; raises as `read_image_bytes`."""
+    return read_image_bytes(path).astype(np.float32) / 255
+
+
+def read_mask(path: Path) -> Bool[np.ndarray, "height width"]:
+    """A mask image: True where white (above half). Raises as `read_image_bytes`."""
+    return _decode(path, "IMREAD_GRAYSCALE") > 127
+
+
+def to_bytes(image: np.ndarray) -> np.ndarray:
+    """Float [0, 1] (clamped), boolean or 8-bit image as uint8."""
+    if image.dtype == np.uint8:
+        return image
+    if image.dtype == bool:
+        return image.astype(np.uint8) * 255
+    return (np.clip(image, 0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+def encode_image(image: np.ndarray, suffix: str, quality: int = 95) -> bytes:
+    """Encode an RGB (height, width, 3) or gray (height, width) image as the format of `suffix` (".png", ".jpg")."""
+    import cv2
+
+    data = to_bytes(image)
+    if data.ndim == 3:
+        data = data[..., ::-1]
+    options = [cv2.IMWRITE_JPEG_QUALITY, quality] if suffix.lower() in (".jpg", ".jpeg") else []
+    return cv2.imencode(suffix, np.ascontiguousarray(data), options)[1].tobytes()
+
+
+def write_image(path: Path, image: np.ndarray, quality: int = 95) -> None:
+    """Write an RGB or gray image atomically; the suffix chooses the format, `quality` applies to JPEG."""
+    write_bytes(path, encode_image(image, Path(path).suffix, quality))
+
+
+def resize(image: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Resize a float or 8-bit image: area averaging when it shrinks, bilinear when it grows."""
+    import cv2
+
+    if image.shape[:2] == (height, width):
+        return image
+    shrinks = width * height < image.shape[0] * image.shape[1]
+    return cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA if shrinks else cv2.INTER_LINEAR)
+
+
+def list_images(folder: Path) -> list[Path]:
+    """Image files under a folder, subfolders included, sorted by name; hidden files are skipped."""
+    return sorted(
+        p
+        for p in Path(folder).rglob("*")
+        if p.suffix.lower() in IMAGE_SUFFIXES and p.is_file() and not p.name.startswith(".")
+    )
+
+
+def write_video(path: Path, frames: Iterable[np.ndarray], fps: float = 24, quality: int = 20) -> int:
+    """Write H.264 MP4 that common players open. Returns the number of frames.
+
+    Args:
+        frames: RGB images, float in [0, 1] or 8-bit, all of one size; odd sizes lose their last row or column.
+        quality: constant rate factor of x264: lower is better, 18 is visually lossless.
+    """
+    import imageio.v3 as iio
+
+    count = 0
+    with atomic_path(path) as temporary, iio.imopen(temporary, "w", plugin="pyav") as file:
+        file.init_video_stream("libx264", fps=fps, pixel_format="yuv420p")
+        # 4.2.0 is what browsers and phones decode; crf is reachable only through the stream's options.
+        file._video_stream.options = {"crf": str(quality), "preset": "medium"}
+        for frame in frames:
+            data = to_bytes(frame)
+            file.write_frame(np.ascontiguousarray(data[: data.shape[0] & ~1, : data.shape[1] & ~1]))
+            count += 1
+    return count
