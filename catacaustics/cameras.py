@@ -84,9 +84,7 @@ class Camera:
         )
         return local @ self.camera_from_world[:3, :3]
 
-    def unproject(
-        self, pixels: Float[np.ndarray, "*n 2"], depth: Float[np.ndarray, "*n"]
-    ) -> Float[np.ndarray, "*n 3"]:
+    def unproject(self, pixels: Float[np.ndarray, "*n 2"], depth: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 3"]:
         """World points at depth z along the rays through pixel coordinates."""
         return self.center + self.ray_directions(pixels) * depth[..., None]
 

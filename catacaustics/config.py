@@ -1,22 +1,20 @@
-"""One frozen dataclass a command: the same object is the Python API, the command line and config.json."""
+"""One frozen dataclass a command: the same object is the Python API, the command line and config.json.
 
-from dataclasses import dataclass, field
+Fields without a default are positional arguments; the text below a field is its help.
+"""
+
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal
-
-import tyro
-
-# tyro is imported for positional markers only; it needs neither torch nor numpy.
-Positional = tyro.conf.Positional
+from typing import Literal
 
 
 @dataclass(frozen=True)
 class CalibrateConfig:
     """Photographs in, a calibrated capture with a fused point cloud out."""
 
-    photos: Positional[Path]
+    photos: Path
     """Folder of photographs, a COLMAP workspace (images/ and sparse/), or a folder with transforms.json."""
-    capture: Positional[Path]
+    capture: Path
     """Folder to write; finished stages found there are kept."""
     masks: Path | None = None
     """Reflector masks at the size of the photographs: MASKS/REFLECTOR/STEM.png, white = reflector."""

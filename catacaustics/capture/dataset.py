@@ -118,9 +118,7 @@ def open_capture(root: Path) -> Capture:
     for image in model.images:
         camera = model.cameras[image.camera_id]
         parameters = pinhole_params(camera)
-        views[image.name] = View(
-            image.name, Camera(camera.width, camera.height, *parameters, image.camera_from_world)
-        )
+        views[image.name] = View(image.name, Camera(camera.width, camera.height, *parameters, image.camera_from_world))
     missing = [name for name in views if not (root / "images" / name).is_file()]
     if missing:
         raise UserError(
