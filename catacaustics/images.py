@@ -15,14 +15,15 @@ RESIZE_FILTER = "area (cv2.INTER_AREA)"
 """The filter of `resize`, named in every report: metrics at another filter cannot be compared."""
 
 
-def _decode(path: Path, flags_name: str) -> np.ndarray:
+def _decode(path: Path, *flag_names: str) -> np.ndarray:
     import cv2
 
     try:
         data = np.fromfile(path, np.uint8)
     except FileNotFoundError as error:
         raise UserError(f"There is no image {path}.", "an image file", "check the path, or restore the file") from error
-    image = cv2.imdecode(data, getattr(cv2, flags_name)) if data.size else None
+    flags = sum(getattr(cv2, name) for name in flag_names)
+    image = cv2.imdecode(data, flags) if data.size else None
     if image is None:
         size = "is empty (0 bytes)" if not data.size else f"cannot be decoded ({data.size} bytes)"
         raise UserError(
@@ -33,13 +34,17 @@ def _decode(path: Path, flags_name: str) -> np.ndarray:
     return image
 
 
-def read_image_bytes(path: Path) -> UInt8[np.ndarray, "height width 3"]:
-    """An image as 8-bit RGB, upright (EXIF orientation applied).
+def read_image_bytes(path: Path, upright: bool = True) -> UInt8[np.ndarray, "height width 3"]:
+    """An image as 8-bit RGB.
+
+    Args:
+        upright: apply the EXIF orientation; COLMAP does not.
 
     Raises:
         UserError: the file is missing, empty or cannot be decoded.
     """
-    return np.ascontiguousarray(_decode(path, "IMREAD_COLOR")[..., ::-1])
+    flags = ("IMREAD_COLOR",) if upright else ("IMREAD_COLOR", "IMREAD_IGNORE_ORIENTATION")
+    return np.ascontiguousarray(_decode(path, *flags)[..., ::-1])
 
 
 def read_image(path: Path) -> Float[np.ndarray, "height width 3"]:
