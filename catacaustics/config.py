@@ -26,3 +26,19 @@ class CalibrateConfig:
     """Every n-th photograph is held out for measuring."""
     stereo_size: int = 800
     """Longer side of the images that multi-view stereo works on."""
+
+
+@dataclass(frozen=True)
+class SplatConfig:
+    """What the splatter computes; every cut-off is here and nowhere else."""
+
+    low_pass: float = 0.3
+    """nu: variance in px^2 added to both axes of every footprint (a pixel-sized low-pass filter)."""
+    support: float = 3.33
+    """Mahalanobis radius of a splat: it contributes nothing outside this ellipse (3.33: below 1/255 of its opacity)."""
+    alpha_min: float = 0.0
+    """Contributions with less alpha are dropped; 0 is exact, 1/255 is common practice."""
+    near: float = 0.01
+    """Points nearer to the camera plane than this (world units) are dropped."""
+    pair_budget: int = 4_000_000
+    """Splat-pixel pairs held at a time: bounds memory at about 60 bytes a pair; results do not depend on it."""

@@ -1,0 +1,5 @@
+"""EWA splatting of oriented disks."""
+
+from catacaustics.splatting.reference import SplatOutput, splat_points
+
+__all__ = ["SplatOutput", "splat_points"]

@@ -1,0 +1,250 @@
+"""The splatter against brute force, closed forms and finite differences."""
+
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from catacaustics.cameras import Camera, Viewport
+from catacaustics.config import SplatConfig
+from catacaustics.geometry import look_at
+from catacaustics.splatting import splat_points
+from catacaustics.splatting.reference import tangent_basis
+
+WIDE = SplatConfig(support=8.0)
+NAMES = ("positions", "normals", "footprints", "opacities", "features")
+
+
+def front_camera(width=24, height=18, focal=30.0):
+    return Camera(width, height, focal, focal * 1.1, width / 2 + 0.3, height / 2 - 0.2, np.eye(4))
+
+
+def random_scene(n, channels=3, seed=0, dtype=torch.float64, size=0.02):
+    g = torch.Generator().manual_seed(seed)
+    positions = torch.rand(n, 3, generator=g, dtype=dtype) * torch.tensor([1.0, 0.8, 1.0]) + torch.tensor(
+        [-0.5, -0.4, 1.0]
+    )
+    normals = torch.nn.functional.normalize(torch.randn(n, 3, generator=g, dtype=dtype), dim=1)
+    footprints = size**2 * (0.5 + torch.rand(n, generator=g, dtype=dtype))
+    opacities = 0.05 + 0.9 * torch.rand(n, generator=g, dtype=dtype)
+    features = torch.rand(n, channels, generator=g, dtype=dtype)
+    return [t.to(dtype) for t in (positions, normals, footprints, opacities, features)]
+
+
+def brute_force(positions, normals, footprints, opacities, features, camera, viewport, config):
+    """Dense evaluation, pixel by point, with the textbook formulas and autograd: nothing shared with the splatter."""
+    pose = torch.tensor(camera.camera_from_world, dtype=positions.dtype)
+    p = positions @ pose[:3, :3].T + pose[:3, 3]
+    n = normals @ pose[:3, :3].T
+    x, y, z = p.unbind(1)
+    zero = torch.zeros_like(x)
+    perspective = torch.stack(
+        [
+            torch.stack([camera.fx / z, zero, -camera.fx * x / z**2], 1),
+            torch.stack([zero, camera.fy / z, -camera.fy * y / z**2], 1),
+        ],
+        1,
+    )
+    disk = torch.eye(3, dtype=p.dtype) - n[:, :, None] * n[:, None, :]
+    sigma = footprints[:, None, None] * perspective @ disk @ perspective.transpose(1, 2)
+    inverse = torch.linalg.inv(sigma + config.low_pass * torch.eye(2, dtype=p.dtype))
+    means = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], 1)
+    columns = torch.arange(viewport.x0, viewport.x0 + viewport.width) + 0.5
+    rows = torch.arange(viewport.y0, viewport.y0 + viewport.height) + 0.5
+    pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1).to(p.dtype)
+    d = pixels[:, :, None] - means
+    q = torch.einsum("hwni,nij,hwnj->hwn", d, inverse, d)
+    alpha = torch.where((q <= config.support**2) & (z > config.near), opacities * torch.exp(-q / 2), 0)
+    order = torch.argsort(z, stable=True)
+    image, through = 0, torch.ones(pixels.shape[:2], dtype=p.dtype)
+    for i in order.tolist():
+        image = image + (through * alpha[:, :, i])[..., None] * features[i]
+        through = through * (1 - alpha[:, :, i])
+    return image, through
+
+
+def weighted_sum(image, transmittance):
+    g = torch.Generator().manual_seed(5)
+    weights = torch.rand(image.shape, generator=g, dtype=image.dtype) - 0.3
+    return (image * weights).sum() + (transmittance * (weights[..., 0] + 0.5)).sum()
+
+
+@pytest.mark.parametrize("budget", [10**9, 300])
+def test_image_and_every_gradient_agree_with_brute_force_whatever_the_memory_budget(budget):
+    config = SplatConfig(support=4.0, pair_budget=budget)
+    camera, viewport = front_camera(), Viewport(3, 2, 17, 13)
+    scene = [t.requires_grad_() for t in random_scene(60)]
+    out = splat_points(*scene, camera, viewport, config)
+    expected = brute_force(*scene, camera, viewport, config)
+    torch.testing.assert_close(out.image, expected[0], rtol=1e-10, atol=1e-12)
+    torch.testing.assert_close(out.transmittance, expected[1], rtol=1e-10, atol=1e-12)
+    got = torch.autograd.grad(weighted_sum(out.image, out.transmittance), scene)
+    want = torch.autograd.grad(weighted_sum(*expected), scene)
+    # Along the normal itself the two parametrisations differ; a unit normal never moves that way.
+    n = scene[1].detach()
+    got, want = list(got), list(want)
+    for grads in (got, want):
+        grads[1] = grads[1] - (grads[1] * n).sum(1, keepdim=True) * n
+    for name, a, b in zip(NAMES, got, want, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-8, atol=1e-10, msg=lambda m, name=name: f"{name}: {m}")
+
+
+@pytest.mark.parametrize("n", [1, 2, 50])
+def test_gradients_pass_finite_differences(n):
+    scene = [t.requires_grad_() for t in random_scene(n, channels=2, seed=n, size=0.15)]
+    camera, viewport = front_camera(), Viewport(9, 6, 5, 4)
+
+    def blend(positions, normals, footprints, opacities, features):
+        unit = torch.nn.functional.normalize(normals, dim=1)
+        out = splat_points(positions, unit, footprints, opacities, features, camera, viewport, WIDE)
+        return out.image, out.transmittance
+
+    # Fast mode checks a random projection of the Jacobian: 50 splats have 550 inputs.
+    assert torch.autograd.gradcheck(blend, scene, eps=1e-6, atol=1e-6, rtol=1e-5, fast_mode=n > 2)
+
+
+def test_one_facing_disk_integrates_to_its_closed_form():
+    """The integral of o exp(-q/2) over the screen is 2 pi o sqrt(det Sigma)."""
+    camera = Camera(101, 101, 50.0, 50.0, 50.5, 50.5, np.eye(4))
+    s, z, opacity = 0.04, 2.0, 0.7
+    one = torch.ones(1, dtype=torch.float64)
+    position = torch.tensor([[0.0, 0.0, z]], dtype=torch.float64)
+    normal = torch.tensor([[0.0, 0.0, -1.0]], dtype=torch.float64)
+    out = splat_points(position, normal, s * one, opacity * one, one[:, None], camera, config=WIDE)
+    variance = s * (50 / z) ** 2 + 0.3
+    assert float(out.image.sum()) == pytest.approx(2 * math.pi * opacity * variance, rel=1e-9)
+
+
+def test_an_opaque_splat_hides_what_is_behind_it_and_gradients_stay_exact():
+    camera = Camera(1, 1, 10.0, 10.0, 0.5, 0.5, np.eye(4))
+    positions = torch.tensor([[0.0, 0, 3], [0.0, 0, 2], [0.0, 0, 4]], dtype=torch.float64)
+    normals = torch.tensor([[0.0, 0, 1]] * 3, dtype=torch.float64)
+    opacities = torch.ones(3, dtype=torch.float64, requires_grad=True)
+    features = torch.tensor([[0.2], [0.5], [0.9]], dtype=torch.float64, requires_grad=True)
+    footprints = torch.full((3,), 1e-4, dtype=torch.float64)
+    out = splat_points(positions, normals, footprints, opacities, features, camera)
+    assert out.image.item() == 0.5
+    assert out.transmittance.item() == 0
+    g_opacity, g_features = torch.autograd.grad(out.image.sum(), (opacities, features))
+    # The front splat at opacity 1: dI/do = c_front - (what is right behind it) = 0.5 - 0.2.
+    torch.testing.assert_close(g_opacity, torch.tensor([0.0, 0.3, 0.0], dtype=torch.float64))
+    torch.testing.assert_close(g_features[:, 0], torch.tensor([0.0, 1.0, 0.0], dtype=torch.float64))
+
+
+def test_a_transparent_splat_still_has_an_opacity_gradient():
+    camera = Camera(1, 1, 10.0, 10.0, 0.5, 0.5, np.eye(4))
+    scene = random_scene(1)
+    scene[0] = torch.tensor([[0.0, 0, 2]], dtype=torch.float64)
+    scene[3] = torch.zeros(1, dtype=torch.float64, requires_grad=True)
+    out = splat_points(*scene, camera)
+    (gradient,) = torch.autograd.grad(out.image.sum(), scene[3])
+    assert float(gradient) == pytest.approx(float(scene[4].sum()), rel=1e-12)
+
+
+def test_points_at_equal_depth_keep_their_input_order():
+    camera = Camera(1, 1, 10.0, 10.0, 0.5, 0.5, np.eye(4))
+    positions = torch.tensor([[0.0, 0, 2]] * 2)
+    normals = torch.tensor([[0.0, 0, 1]] * 2)
+    features = torch.tensor([[1.0], [2.0]])
+    out = splat_points(positions, normals, torch.full((2,), 1e-4), torch.ones(2), features, camera)
+    assert float(out.image) == 1.0
+
+
+def test_input_order_does_not_matter_where_depths_differ():
+    scene = random_scene(80)
+    shuffle = torch.randperm(80, generator=torch.Generator().manual_seed(1))
+    a = splat_points(*scene, front_camera())
+    b = splat_points(*(t[shuffle] for t in scene), front_camera())
+    torch.testing.assert_close(a.image, b.image, rtol=1e-13, atol=1e-14)
+
+
+def test_a_viewport_is_a_crop_and_may_reach_outside_the_image():
+    scene = random_scene(60)
+    camera = front_camera()
+    whole = splat_points(*scene, camera, Viewport(-4, -4, 40, 30))
+    part = splat_points(*scene, camera, Viewport(2, 3, 5, 7))
+    torch.testing.assert_close(part.image, whole.image[7:14, 6:11], rtol=1e-12, atol=1e-14)
+
+
+def test_the_camera_pose_moves_the_image_as_moving_the_points_does():
+    scene = random_scene(40)
+    pose = look_at(np.array([0.3, -0.2, -0.5]), np.array([0.0, 0.0, 1.5]), np.array([0.0, -1.0, 0.1]))
+    moved = Camera(24, 18, 30.0, 33.0, 12.0, 9.0, pose)
+    rotation, translation = torch.tensor(pose[:3, :3]), torch.tensor(pose[:3, 3])
+    a = splat_points(*scene, moved)
+    fixed = Camera(24, 18, 30.0, 33.0, 12.0, 9.0, np.eye(4))
+    b = splat_points(scene[0] @ rotation.T + translation, scene[1] @ rotation.T, *scene[2:], fixed)
+    torch.testing.assert_close(a.image, b.image, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("angle", [1e-3, 1e-6, 0.0])
+def test_grazing_disks_stay_finite_and_agree_with_float64(angle):
+    camera = Camera(40, 30, 40.0, 40.0, 20.0, 15.0, np.eye(4))
+    directions = []
+    for dtype in (torch.float32, torch.float64):
+        position = torch.tensor([[0.1, 0.05, 1.0]], dtype=dtype, requires_grad=True)
+        ray = torch.tensor([0.1, 0.05, 1.0], dtype=torch.float64)
+        side = torch.nn.functional.normalize(torch.linalg.cross(ray, torch.tensor([0.0, 1.0, 0.3]).double()), dim=0)
+        view = torch.nn.functional.normalize(ray, dim=0)
+        normal = (math.cos(angle) * side + math.sin(angle) * view).to(dtype)[None]
+        one = torch.ones(1, dtype=dtype)
+        out = splat_points(position, normal, 0.05 * one, 0.8 * one, one[:, None], camera)
+        (gradient,) = torch.autograd.grad(out.image.sum(), position)
+        directions.append((out.image.detach().double(), gradient.double()))
+    assert all(torch.isfinite(t).all() for pair in directions for t in pair)
+    torch.testing.assert_close(directions[0][0], directions[1][0], rtol=1e-3, atol=1e-4)
+
+
+@pytest.mark.parametrize("n", [0, 5])
+def test_nothing_in_view_gives_black_and_full_transmittance(n):
+    scene = random_scene(5)
+    scene = [t[:n] for t in scene]
+    scene[0] = scene[0] - torch.tensor([0.0, 0.0, 5.0], dtype=torch.float64)
+    out = splat_points(*scene, front_camera())
+    assert out.image.abs().max() == 0
+    assert out.transmittance.min() == 1
+
+
+def test_a_small_pair_budget_gives_the_same_float32_image_as_an_ample_one():
+    scene = random_scene(500, dtype=torch.float32, size=0.2)
+    camera = front_camera()
+    small = splat_points(*scene, camera, config=SplatConfig(pair_budget=20_000))
+    ample = splat_points(*scene, camera, config=SplatConfig(pair_budget=10**8))
+    torch.testing.assert_close(small.image, ample.image, rtol=1e-5, atol=1e-6)
+
+
+def test_cut_off_at_small_alpha_changes_the_image_by_no_more_than_what_it_drops():
+    scene = random_scene(60)
+    exact = splat_points(*scene, front_camera(), config=SplatConfig(support=6.0))
+    cut = splat_points(*scene, front_camera(), config=SplatConfig(support=6.0, alpha_min=1 / 255))
+    error = (exact.transmittance - cut.transmittance).abs().max()
+    assert 0 < error < 60 / 255
+
+
+@pytest.mark.parametrize("index", range(5))
+def test_a_nan_is_refused_with_the_tensors_name_and_its_place(index):
+    scene = random_scene(6)
+    scene[index].view(-1)[4] = float("nan")
+    with pytest.raises(ValueError, match=f"{NAMES[index]} has 1 values that are not finite, the first at"):
+        splat_points(*scene, front_camera())
+
+
+def test_values_out_of_range_and_wrong_types_are_refused_by_name():
+    for index, value, message in ((2, -1.0, "footprints"), (3, 1.5, "opacities"), (3, -0.5, "opacities")):
+        scene = random_scene(6)
+        scene[index][3] = value
+        with pytest.raises(ValueError, match=rf"{message}.*\[3\]"):
+            splat_points(*scene, front_camera())
+    scene = random_scene(6)
+    scene[4] = scene[4].float()
+    with pytest.raises(ValueError, match="features must be float32 or float64 like positions"):
+        splat_points(*scene, front_camera())
+
+
+def test_tangents_and_normal_are_orthonormal_for_every_direction():
+    normals = torch.nn.functional.normalize(torch.randn(1000, 3, dtype=torch.float64), dim=1)
+    normals[:2] = torch.tensor([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]])
+    frame = torch.stack([*tangent_basis(normals), normals], 1)
+    identity = torch.eye(3, dtype=torch.float64).expand(1000, 3, 3)
+    torch.testing.assert_close(frame @ frame.transpose(1, 2), identity, atol=1e-12, rtol=0)
