@@ -1,10 +1,13 @@
-"""Rigid and similarity transforms. A transform named `b_from_a` takes coordinates in a to coordinates in b."""
+"""Rigid and similarity transforms; convex polyhedra.
+
+A transform named `b_from_a` takes coordinates in a to coordinates in b.
+"""
 
 from typing import NamedTuple
 
 import numpy as np
 
-from catacaustics.shapes import Float
+from catacaustics.shapes import Float, Int
 
 
 class Similarity(NamedTuple):
@@ -18,7 +21,7 @@ class Similarity(NamedTuple):
         return self.scale * points @ self.rotation.T + self.translation
 
 
-def normalize(vectors: Float[np.ndarray, "*batch 3"]) -> Float[np.ndarray, "*batch 3"]:
+def normalize(vectors: Float[np.ndarray, "*batch d"]) -> Float[np.ndarray, "*batch d"]:
     """Unit vectors; a zero vector stays zero."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors / np.where(length > 0, length, 1)
@@ -80,3 +83,62 @@ def fit_similarity(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "
     rotation = (u * sign) @ vt
     scale = float((singular * sign).sum() / (a**2).sum(1).mean())
     return Similarity(scale, rotation, target_mean - scale * rotation @ source_mean)
+
+
+# Convex polyhedra. A half-space (n, d) is the set of x with n . x + d <= 0; n has unit length and points outward.
+
+
+def chebyshev_center(halfspaces: Float[np.ndarray, "k 4"]) -> tuple[Float[np.ndarray, "3"], float]:
+    """Centre and radius of the largest ball inside an intersection of half-spaces, by linear programming.
+
+    The radius is negative where the intersection is empty (minus the smallest violation that a point can have), and
+    infinite where balls of any size fit.
+    """
+    from scipy.optimize import linprog
+
+    bounds = [(None, None)] * 4
+    matrix = np.concatenate([halfspaces[:, :3], np.ones((len(halfspaces), 1))], -1)
+    answer = linprog([0, 0, 0, -1], A_ub=matrix, b_ub=-halfspaces[:, 3], bounds=bounds, method="highs")
+    if answer.x is None:  # the problem always has a feasible point, so it is unbounded
+        return np.zeros(3), np.inf
+    return answer.x[:3], float(answer.x[3])
+
+
+def is_bounded(normals: Float[np.ndarray, "k 3"]) -> bool:
+    """Whether a non-empty intersection of half-spaces with these outward normals is bounded: no direction v, other
+    than zero, has n . v <= 0 for all of them."""
+    from scipy.optimize import linprog
+
+    for objective in np.concatenate([np.eye(3), -np.eye(3)]):
+        answer = linprog(objective, A_ub=normals, b_ub=np.zeros(len(normals)), bounds=[(-1, 1)] * 3, method="highs")
+        if answer.fun < -1e-6:
+            return False
+    return True
+
+
+def intersect_halfspaces(
+    halfspaces: Float[np.ndarray, "k 4"], inside: Float[np.ndarray, "3"]
+) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "m"]]:
+    """Vertices of a bounded intersection of half-spaces, and the indices of the half-spaces that bound it.
+
+    Args:
+        inside: a point strictly inside, such as the Chebyshev centre.
+    """
+    from scipy.spatial import HalfspaceIntersection
+
+    result = HalfspaceIntersection(halfspaces, inside)
+    return result.intersections, np.unique(np.concatenate([np.asarray(f, int) for f in result.dual_facets]))
+
+
+def hull_mesh(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
+    """Convex hull of points as a triangle mesh: vertices, and faces that run counter-clockwise seen from outside."""
+    from scipy.spatial import ConvexHull
+
+    hull = ConvexHull(points)
+    index = np.full(len(points), -1)
+    index[hull.vertices] = np.arange(len(hull.vertices))
+    faces, corners = index[hull.simplices], points[hull.simplices]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    inward = (normals * hull.equations[:, :3]).sum(-1) < 0
+    faces[inward] = faces[inward][:, ::-1]
+    return points[hull.vertices], faces

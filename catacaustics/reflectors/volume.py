@@ -1,0 +1,353 @@
+"""Reflection volume: painted masks of a reflector, seen by calibrated cameras, bound a convex polyhedron around it.
+
+Each mask's convex hull, lifted through its camera, is a pyramid; the volume is the intersection of the pyramids
+(Neural Point Catacaustics, 2022, section 4.2). Every step errs on the large side: the volume holds every object whose
+pictures lie inside the masks.
+"""
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+
+from catacaustics.cameras import Camera, Viewport
+from catacaustics.capture.dataset import Capture
+from catacaustics.errors import UserError
+from catacaustics.files import read_json, write_bytes, write_json
+from catacaustics.geometry import (
+    chebyshev_center,
+    hull_mesh,
+    intersect_halfspaces,
+    is_bounded,
+    normalize,
+    transform,
+)
+from catacaustics.shapes import Bool, Float, Int
+
+_SMALLEST = 1e-6
+"""Inscribed radius, in units of the cameras' spread, below which an intersection counts as empty."""
+
+
+@dataclass(frozen=True, eq=False)
+class ReflectionVolume:
+    """A convex polyhedron around a reflector.
+
+    Args:
+        name: the reflector's name.
+        halfspaces: n . x + d <= 0 inside, n of unit length and outward.
+        vertices: corners.
+        faces: triangles, counter-clockwise seen from outside.
+    """
+
+    name: str
+    halfspaces: Float[np.ndarray, "k 4"]
+    vertices: Float[np.ndarray, "v 3"]
+    faces: Int[np.ndarray, "f 3"]
+
+    def contains(self, points: Float[np.ndarray, "*n 3"]) -> Bool[np.ndarray, "*n"]:
+        """Whether points lie inside or on the surface (to 1e-7 of the radius)."""
+        return (points @ self.halfspaces[:, :3].T + self.halfspaces[:, 3] <= 1e-7 * self.radius).all(-1)
+
+    @cached_property
+    def _cross(self) -> np.ndarray:
+        """Outward normals of the faces, as long as twice their areas."""
+        a, b, c = np.moveaxis(self.vertices[self.faces], 1, 0)
+        return np.cross(b - a, c - a)
+
+    @property
+    def area(self) -> float:
+        """Surface area."""
+        return float(np.linalg.norm(self._cross, axis=-1).sum() / 2)
+
+    @cached_property
+    def center(self) -> Float[np.ndarray, "3"]:
+        """Centre of mass of the solid."""
+        middle = self.vertices.mean(0)
+        corners = self.vertices[self.faces] - middle
+        volumes = (corners[:, 0] * self._cross).sum(-1)  # of the tetrahedra from `middle`, times 6
+        return middle + (corners.sum(1) / 4 * volumes[:, None]).sum(0) / volumes.sum()
+
+    @cached_property
+    def radius(self) -> float:
+        """Radius of the ball about `center` that holds the volume."""
+        return float(np.linalg.norm(self.vertices - self.center, axis=-1).max())
+
+    def sample_surface(
+        self, n: int, rng: np.random.Generator
+    ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+        """Random points, uniform by area, and their outward unit normals."""
+        areas = np.linalg.norm(self._cross, axis=-1)
+        face = rng.choice(len(areas), n, p=areas / areas.sum())
+        u, v = rng.random((2, n, 1))
+        root = np.sqrt(u)
+        a, b, c = np.moveaxis(self.vertices[self.faces[face]], 1, 0)
+        return (1 - root) * a + root * (1 - v) * b + root * v * c, normalize(self._cross[face])
+
+    def project_mask(self, camera: Camera, viewport: Viewport | None = None) -> Bool[np.ndarray, "height width"]:
+        """True at pixels whose centres see the volume. Parts behind the camera are cut off; a camera inside the volume
+        sees it everywhere."""
+        view = viewport or camera.viewport
+        if self.contains(camera.center[None])[0]:
+            return np.ones((view.height, view.width), bool)
+        polygon = _projected_polygon(self, camera)
+        return _fill_convex(polygon - [view.x0, view.y0], view.width, view.height)
+
+    def save(self, path: Path) -> None:
+        """Write as JSON."""
+        parts = {key: getattr(self, key).tolist() for key in ("halfspaces", "vertices", "faces")}
+        write_json(path, {"name": self.name, **parts})
+
+    @staticmethod
+    def load(path: Path) -> "ReflectionVolume":
+        """Read a file written by `save`; raises UserError where it is missing or something else."""
+        value = read_json(path)
+        try:
+            parts = (np.array(value["halfspaces"], float), np.array(value["vertices"], float), np.array(value["faces"]))
+            if any(p.ndim != 2 or p.shape[1] != n for p, n in zip(parts, (4, 3, 3), strict=True)):
+                raise ValueError("wrong shapes")
+            return ReflectionVolume(str(value["name"]), *parts)
+        except (KeyError, TypeError, ValueError) as error:
+            raise UserError(
+                f"{path} is not a reflection volume: {error!r}.",
+                "name, halfspaces (k, 4), vertices (v, 3) and faces (f, 3)",
+                "delete it and build the volume from the masks again",
+            ) from error
+
+    def write_mesh(self, path: Path) -> None:
+        """Write the surface as a PLY triangle mesh, for mesh viewers."""
+        import io
+
+        from plyfile import PlyData, PlyElement
+
+        vertices = np.array([tuple(v) for v in self.vertices], [(axis, "f4") for axis in "xyz"])
+        faces = np.array([(f,) for f in self.faces.astype(np.int32)], [("vertex_indices", "i4", (3,))])
+        buffer = io.BytesIO()
+        PlyData([PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]).write(buffer)
+        write_bytes(path, buffer.getvalue())
+
+
+def _projected_polygon(volume: ReflectionVolume, camera: Camera) -> np.ndarray:
+    """Outline in pixels (counter-clockwise corners) of the part in front of the camera; (0, 2) where nothing is."""
+    from scipy.spatial import ConvexHull
+
+    points = transform(camera.camera_from_world, volume.vertices)
+    near = 1e-6 * volume.radius
+    edges = points[volume.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)]
+    crossing = edges[(edges[:, 0, 2] > near) & (edges[:, 1, 2] <= near)]
+    t = (crossing[:, 0, 2] - near) / (crossing[:, 0, 2] - crossing[:, 1, 2])
+    cut = crossing[:, 0] + t[:, None] * (crossing[:, 1] - crossing[:, 0])
+    seen = np.concatenate([points[points[:, 2] > near], cut])
+    if not len(seen):
+        return np.zeros((0, 2))
+    pixels = seen[:, :2] / seen[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+    return pixels[ConvexHull(pixels).vertices]
+
+
+def _fill_convex(polygon: np.ndarray, width: int, height: int) -> np.ndarray:
+    """Pixels whose centres lie inside a convex polygon (to 1e-6 pixels): for each row, from the leftmost to the
+    rightmost crossing. Unlike an integer rasterizer it takes corners far outside the image."""
+    if not len(polygon):
+        return np.zeros((height, width), bool)
+    y = np.arange(height)[:, None] + 0.5
+    (x0, y0), (x1, y1) = polygon.T, np.roll(polygon, -1, 0).T
+    crosses = (np.minimum(y0, y1) <= y) & (y <= np.maximum(y0, y1)) & (y0 != y1)
+    x = x0 + (y - y0) / np.where(y0 != y1, y1 - y0, 1) * (x1 - x0)
+    left = np.where(crosses, x, np.inf).min(1, keepdims=True)
+    right = np.where(crosses, x, -np.inf).max(1, keepdims=True)
+    centers = np.arange(width) + 0.5
+    return (left - 1e-6 <= centers) & (centers <= right + 1e-6)
+
+
+def _hull_chains(mask: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+    """Convex hull of a mask's pixel squares, (n, 2) corners with positive turn in (x, y), and its outline as chains of
+    corners: one closed chain, or, where it runs along the image's border, the open chains between."""
+    import cv2
+
+    height, width = mask.shape
+    rows = np.flatnonzero(mask.any(1))
+    left, right = mask[rows].argmax(1), width - mask[rows, ::-1].argmax(1)
+    corners = [np.stack([x, y], -1) for x in (left, right) for y in (rows, rows + 1)]
+    hull = cv2.convexHull(np.concatenate(corners).astype(np.int32))[:, 0].astype(np.float64)
+    following = np.roll(hull, -1, 0)
+    if (hull[:, 0] * following[:, 1] - hull[:, 1] * following[:, 0]).sum() < 0:
+        hull = hull[::-1]
+        following = np.roll(hull, -1, 0)
+    border = ((hull == following) & ((hull == 0) | (hull == [width, height]))).any(1)
+    if not border.any():
+        return hull, [np.concatenate([hull, hull[:1]])]
+    order = (np.arange(len(hull)) + np.flatnonzero(border)[0] + 1) % len(hull)
+    chains = np.split(hull[order], np.flatnonzero(border[order]) + 1)
+    return hull, [chain for chain in chains if len(chain) > 1]
+
+
+def _outward(edges: np.ndarray) -> np.ndarray:
+    """Unit normals of edges (m, 2 ends, 2) of an outline with positive turn."""
+    along = edges[:, 1] - edges[:, 0]
+    return normalize(np.stack([along[:, 1], -along[:, 0]], -1))
+
+
+def mask_halfplanes(mask: Bool[np.ndarray, "height width"], tolerance: float = 0.5) -> Float[np.ndarray, "m 3"]:
+    """Half-planes a x + b y + c <= 0 (pixels) whose intersection is a simple polygon around a mask.
+
+    The convex hull of the mask's pixel squares is simplified by Douglas-Peucker; then each edge is pushed outwards
+    until the whole hull is behind it.
+
+    Where the hull runs along the image's border it makes no half-plane: the object may go on there. The edges that end
+    on the border are prolonged outside, where the staircase of pixels would turn them into the object: those shorter
+    than 8 pixels are left out, the first longer one is turned outwards by a pixel over its length.
+
+    Args:
+        tolerance: of the simplification, in pixels.
+    """
+    import cv2
+
+    hull, chains = _hull_chains(mask)
+    edges = []
+    for chain in chains:
+        closed = np.array_equal(chain[0], chain[-1])
+        points = (chain[:-1] if closed else chain).astype(np.float32)
+        corners = cv2.approxPolyDP(points[:, None], tolerance, closed)[:, 0].astype(np.float64)
+        if closed:
+            if len(corners) < 3:  # the tolerance is wider than the mask
+                corners = hull
+            edges.append(np.stack([corners, np.roll(corners, -1, 0)], 1))
+            continue
+        sides = np.stack([corners[:-1], corners[1:]], 1)
+        long = np.flatnonzero(np.linalg.norm(sides[:, 1] - sides[:, 0], axis=-1) >= 8)
+        if len(long):
+            first, last = sides[long[0]].copy(), sides[long[-1]].copy()
+            first[0] += _outward(first[None])[0]
+            last[1] += _outward(last[None])[0]
+            edges.append(np.concatenate([first[None], sides[long[0] + 1 : long[-1]], last[None]]))
+    if not edges:
+        return np.zeros((0, 3))
+    normals = _outward(np.concatenate(edges))
+    return np.concatenate([normals, -(hull @ normals.T).max(0)[:, None]], -1)
+
+
+def lift_halfplanes(camera: Camera, halfplanes: Float[np.ndarray, "m 3"]) -> Float[np.ndarray, "k 4"]:
+    """The pyramid over a polygon in the image: half-spaces in world coordinates, the last one "in front of the
+    camera"."""
+    local = np.concatenate([halfplanes @ camera.intrinsics, [[0, 0, -1]]])
+    local = normalize(local)
+    return np.concatenate([local @ camera.camera_from_world[:3, :3], local @ camera.camera_from_world[:3, 3:]], -1)
+
+
+def _check_mask(name: str, camera: Camera, mask: np.ndarray, view: str) -> None:
+    def refuse(found: str, remedy: str) -> None:
+        raise UserError(f"The mask of {name} in view {view} {found}.", "a mask that outlines the object", remedy)
+
+    if mask.shape != (camera.height, camera.width):
+        size = f"{mask.shape[1]} x {mask.shape[0]} pixels, its photograph {camera.width} x {camera.height}"
+        refuse(f"has {size}", "paint it on the undistorted photograph")
+    if not mask.any():
+        refuse("is all black", "paint the object white, or delete the file where the object is not seen")
+    if mask.all():
+        refuse("is all white", "paint only the object white, or delete the file")
+
+
+def _conflicting(names: list[str], groups: list[np.ndarray]) -> list[str]:
+    """Views to blame for an empty intersection: each that alone, left out, mends it; where there is none, a small set
+    that mends it together."""
+    from scipy.optimize import linprog
+
+    def meet(chosen: list[int]) -> bool:
+        return bool(chosen) and chebyshev_center(np.concatenate([groups[i] for i in chosen]))[1] > _SMALLEST
+
+    everyone = list(range(len(groups)))
+    blamed = [i for i in everyone if meet([j for j in everyone if j != i])]
+    if not blamed:
+        # The point with the smallest sum of violations satisfies most views; take back those that fit in with them.
+        view = np.repeat(everyone, [len(g) for g in groups])
+        planes = np.concatenate(groups)
+        matrix = np.concatenate([planes[:, :3], -np.eye(len(groups))[view]], -1)
+        bounds = [(None, None)] * 3 + [(0, None)] * len(groups)
+        objective = np.r_[np.zeros(3), np.ones(len(groups))]
+        slack = linprog(objective, A_ub=matrix, b_ub=-planes[:, 3], bounds=bounds, method="highs").x[3:]
+        kept = [i for i in everyone if slack[i] <= _SMALLEST]
+        for i in np.argsort(slack)[len(kept) :].tolist():
+            if meet([*kept, i]):
+                kept.append(i)
+        blamed = [i for i in everyone if i not in kept]
+    return [names[i] for i in blamed]
+
+
+def _listed(names: list[str], most: int = 6) -> str:
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
+
+
+def volume_from_masks(
+    name: str, masks: list[tuple[str, Camera, Bool[np.ndarray, "height width"]]], tolerance: float = 0.5
+) -> ReflectionVolume:
+    """Intersect the pyramids over masks.
+
+    A mask may have several parts (something stands in front of the object): its hull counts. Where a mask touches the
+    image's border the object is taken to go on outside, so that other views must bound it there.
+
+    Args:
+        name: the reflector's name, for messages.
+        masks: (view name, camera, mask) of 2 or more views; 3 or 4 from well separated directions are enough.
+        tolerance: of the outline's simplification, in pixels.
+
+    Raises:
+        UserError: a mask is unusable, the masks contradict each other, or they leave the volume open; the message
+            names the views to repaint.
+    """
+    if not masks:
+        raise UserError(
+            f"The reflector {name} has no masks.", "masks in 3 or 4 views", "paint them in the mask painter"
+        )
+    views = [view for view, _, _ in masks]
+    for view, camera, mask in masks:
+        _check_mask(name, camera, mask, view)
+    groups = [lift_halfplanes(camera, mask_halfplanes(mask, tolerance)) for _, camera, mask in masks]
+
+    # Linear programming needs numbers near 1: put the origin amid the cameras, and their spread to 1.
+    centers = np.array([camera.center for _, camera, _ in masks])
+    origin = centers.mean(0)
+    spread = np.linalg.norm(centers - origin, axis=-1).max()
+    scale = spread if spread > 1e-12 * (1 + np.abs(origin).max()) else 1.0
+    groups = [np.c_[g[:, :3], (g[:, 3] + g[:, :3] @ origin) / scale] for g in groups]
+    planes = np.concatenate(groups)
+
+    inside, radius = chebyshev_center(planes)
+    if radius <= _SMALLEST:
+        raise UserError(
+            f"The masks of {name} contradict each other: no point in space is inside all {len(masks)}.",
+            "masks of the same object, around all of it, and correctly calibrated views",
+            f"repaint or delete the masks of {_listed(_conflicting(views, groups))}",
+        )
+    bounded = np.isfinite(radius) and is_bounded(planes[:, :3])
+    vertices, active = intersect_halfspaces(planes, inside) if bounded else (np.full((1, 3), np.inf), np.arange(0))
+    if np.abs(vertices).max() > 1e4:
+        raise UserError(
+            f"The masks of {name} leave its volume open: the object could reach to infinity as seen from "
+            f"{_listed(views)}.",
+            "masks in 3 or 4 views from clearly different directions, clear of the image border in most",
+            f"paint {name} in another view, from the side of those{_border_hint(views, masks)}",
+        )
+    vertices, faces = hull_mesh(vertices * scale + origin)
+    kept = planes[active]
+    halfspaces = np.c_[kept[:, :3], kept[:, 3] * scale - kept[:, :3] @ origin]
+    return ReflectionVolume(name, halfspaces, vertices, faces)
+
+
+def _border_hint(views: list[str], masks: list[tuple[str, Camera, np.ndarray]]) -> str:
+    touching = [v for v, (_, _, m) in zip(views, masks, strict=True) if m[[0, -1]].any() or m[:, [0, -1]].any()]
+    return f"; the masks of {_listed(touching)} touch the image border and are open there" if touching else ""
+
+
+def build_volume(capture: Capture, reflector: str) -> ReflectionVolume:
+    """The volume of one of a capture's reflectors, from its masks in training views (in all views where fewer than 3
+    training views have one); raises as `volume_from_masks`."""
+    if reflector not in capture.reflectors:
+        raise UserError(
+            f"The capture {capture.root} has no masks of a reflector {reflector}.",
+            f"one of: {', '.join(capture.reflectors) or 'none yet'}",
+            f"paint masks into {capture.root / 'masks' / reflector}",
+        )
+    masked = [v for v in capture.train if capture.mask_path(v, reflector).is_file()]
+    if len(masked) < 3:
+        masked = [v for v in capture.views if capture.mask_path(v, reflector).is_file()]
+    return volume_from_masks(reflector, [(v.name, v.camera, capture.mask(v, reflector)) for v in masked])
