@@ -241,6 +241,8 @@ def test_measures_of_a_cube():
     np.testing.assert_allclose(volume.center, 0, atol=1e-12)
     points = np.array([[0.9, -0.9, 0.9], [1, 1, 1], [1.01, 0, 0], [0, 0, -3]])
     assert volume.contains(points).tolist() == [True, True, False, False]
+    many = np.random.default_rng(0).uniform(-2, 2, (3, 5000, 3))
+    assert np.array_equal(volume.contains(many), (np.abs(many) <= 1).all(-1))
 
 
 def test_the_centre_is_that_of_the_solid_not_of_the_corners():

@@ -47,7 +47,13 @@ class ReflectionVolume:
 
     def contains(self, points: Float[np.ndarray, "*n 3"]) -> Bool[np.ndarray, "*n"]:
         """Whether points lie inside or on the surface (to 1e-7 of the radius)."""
-        return (points @ self.halfspaces[:, :3].T + self.halfspaces[:, 3] <= 1e-7 * self.radius).all(-1)
+        flat = points.reshape(-1, 3)
+        inside = np.ones(len(flat), bool)
+        normals, limits = self.halfspaces[:, :3], 1e-7 * self.radius - self.halfspaces[:, 3]
+        for start in range(0, len(flat), 4096):  # thousands of half-spaces times points would not fit in memory
+            block = slice(start, start + 4096)
+            inside[block] = (flat[block] @ normals.T <= limits).all(-1)
+        return inside.reshape(points.shape[:-1])
 
     @cached_property
     def _cross(self) -> np.ndarray:
