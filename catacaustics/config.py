@@ -42,3 +42,132 @@ class SplatConfig:
     """Points nearer to the camera plane than this (world units) are dropped."""
     pair_budget: int = 4_000_000
     """Splat-pixel pairs held at a time: bounds memory at about 60 bytes a pair; results do not depend on it."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """A calibrated capture in, a trained scene out. Learning rates of positions are relative to the scene's extent."""
+
+    capture: Path
+    """Folder made by `catacaustics calibrate`."""
+    run: Path
+    """Folder to write: scene.safetensors, checkpoint, metrics.jsonl, report.html."""
+    warp: Literal["none", "static", "neural"] = "neural"
+    """How reflection points follow the camera; none trains the primary cloud alone."""
+    resume: bool = False
+    """Go on from the run's last checkpoint."""
+    iterations: int = 30_000
+    """Optimiser steps at most."""
+    minutes: float | None = None
+    """Stop after this much training time; schedules then follow time instead of steps."""
+    image_size: int = 1000
+    """Longer side of the photographs in training; larger ones are reduced."""
+    patch: int = 150
+    """Side of the square training patches; photographs smaller than that are used whole."""
+    accumulate: int = 1
+    """Patches whose gradients are summed before a step (paper: 20)."""
+    reflector_share: float = 0.5
+    """Share of patches centred on a reflector; the others are anywhere."""
+    primary_points: int = 200_000
+    """Primary points at the start, at most; the cloud is thinned at random."""
+    max_primary_points: int = 1_000_000
+    """Densification never exceeds this."""
+    reflection_points: int = 50_000
+    """Points on each reflection volume (paper: 400 000)."""
+    environment_width: int = 1000
+    """Columns of the environment map (rows: 0.4 of it); 0 leaves it out."""
+    warp_layers: int = 4
+    warp_width: int = 256
+    renderer_width: int = 32
+    renderer_layers: int = 9
+    densify_every: int = 2000
+    """Steps between densifications of the primary cloud; 0 switches it off."""
+    densify_share: float = 0.05
+    """Share of the points, those with the highest view-space gradients, that spawn a point each time."""
+    weight_l1: float = 0.05
+    weight_dssim: float = 0.2
+    weight_coverage: float = 0.01
+    weight_rho: float = 0.01
+    weight_tv: float = 1e-5
+    lr_position: float = 1.6e-4
+    lr_position_final: float = 1.6e-6
+    lr_normal: float = 1e-3
+    lr_footprint: float = 5e-3
+    lr_opacity: float = 5e-2
+    lr_features: float = 5e-3
+    lr_network: float = 1e-3
+    lr_network_final: float = 1e-4
+    warp_weight_decay: float = 1e-2
+    checkpoint_minutes: float = 2.0
+    seed: int = 0
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+
+
+@dataclass(frozen=True)
+class EvaluateConfig:
+    """Measure a trained scene on its held-out views; writes metrics.json and report.html into the run's folder."""
+
+    run: Path
+    """Folder that training wrote."""
+    capture: Path | None = None
+    """The capture, where it is no longer at the place that training noted."""
+    shown_views: int = 12
+    """Held-out views with pictures in the report, spread evenly; all of them are measured."""
+
+
+@dataclass(frozen=True)
+class RenderConfig:
+    """Render a video of a trained scene along a camera path."""
+
+    run: Path
+    """Folder that training wrote."""
+    video: Path
+    """MP4 file to write. Finished frames are kept beside it until it is complete."""
+    path: Literal["held-out", "spline"] = "held-out"
+    """held-out: through the held-out views in order; spline: a tour of the training views, nearest neighbour next."""
+    layers: tuple[Literal["rgb", "primary", "reflection", "weight", "depth"], ...] = ("rgb",)
+    """What to show; several layers stand side by side."""
+    seconds: float = 10.0
+    """Length of the video."""
+    fps: float = 24.0
+    """Frames per second."""
+    width: int = 800
+    """Width of each layer in pixels; the height follows from the camera."""
+    quality: int = 20
+    """Constant rate factor of H.264: lower is better and larger, 18 is visually lossless."""
+    capture: Path | None = None
+    """The capture, where it is no longer at the place that training noted."""
+
+
+@dataclass(frozen=True)
+class ReconstructConfig:
+    """Photographs in, a trained scene with its report out: calibrate, train and evaluate in one go.
+
+    Run the same command again after an interruption: it goes on at the first unfinished stage.
+    """
+
+    photos: Path
+    """Folder of photographs, a COLMAP workspace, a folder with transforms.json, or a calibrated capture."""
+    out: Path
+    """Folder to write: capture/ (cameras and points) and run/ (scene and report)."""
+    masks: Path | None = None
+    """Reflector masks at the size of the photographs: MASKS/REFLECTOR/STEM.png, white = reflector."""
+    warp: Literal["none", "static", "neural"] = "neural"
+    """How reflection points follow the camera; none trains the primary cloud alone."""
+    iterations: int = 30_000
+    """Optimiser steps at most."""
+    minutes: float | None = None
+    """Stop training after this much time; schedules then follow time instead of steps."""
+    image_size: int = 1000
+    """Longer side of the photographs in training."""
+    primary_points: int = 200_000
+    """Primary points at the start, at most."""
+    reflection_points: int = 50_000
+    """Points on each reflection volume."""
+    seed: int = 0
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+
+
+@dataclass(frozen=True)
+class DoctorConfig:
+    """What is installed, what it can do here, and what would make it faster."""

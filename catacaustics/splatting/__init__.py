@@ -1,5 +1,5 @@
 """EWA splatting of oriented disks."""
 
-from catacaustics.splatting.reference import SplatOutput, splat_points
+from catacaustics.splatting.reference import SplatOutput, points_in_view, splat_points
 
-__all__ = ["SplatOutput", "splat_points"]
+__all__ = ["SplatOutput", "points_in_view", "splat_points"]

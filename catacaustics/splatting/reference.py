@@ -421,3 +421,32 @@ def _check(positions: Tensor, normals: Tensor, footprints: Tensor, opacities: Te
         raise ValueError(
             f"opacities must be >= 0: the first that is not is at [{int(torch.nonzero(opacities < 0)[0])}]"
         )
+
+
+def points_in_view(
+    positions: Float[Tensor, "n 3"],
+    footprints: Float[Tensor, "n"],
+    camera: Camera,
+    viewport: Viewport,
+    config: SplatConfig | None = None,
+) -> Int[Tensor, "m"]:
+    """Indices of the points that may touch a viewport: a cheap cull before features and gradients are computed.
+
+    Conservative: whatever its normal, a disk's variance along screen x is at most s (fx/z)^2 (1 + (x/z)^2) + nu.
+    """
+    config = config or SplatConfig()
+    with torch.no_grad():
+        pose = torch.tensor(camera.camera_from_world, dtype=positions.dtype, device=positions.device)
+        x, y, z = (positions @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
+        ahead = z > config.near
+        inv_z = torch.where(ahead, 1 / z, 1)
+        inside = ahead
+        axes = (
+            (x * inv_z, camera.fx, camera.cx, viewport.x0, viewport.width),
+            (y * inv_z, camera.fy, camera.cy, viewport.y0, viewport.height),
+        )
+        for slope, focal, center, start, size in axes:
+            reach = config.support * (footprints * (focal * inv_z) ** 2 * (1 + slope**2) + config.low_pass).sqrt()
+            mean = focal * slope + center
+            inside = inside & (mean + reach > start) & (mean - reach < start + size)
+        return torch.nonzero(inside)[:, 0]

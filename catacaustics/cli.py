@@ -1,0 +1,62 @@
+"""`catacaustics <command>`. Nothing heavy is imported before the command is known, so that help answers at once."""
+
+import importlib
+import sys
+
+from catacaustics.errors import UserError
+
+# command: (module, function, configuration)
+_COMMANDS = {
+    "reconstruct": ("catacaustics.reconstruct", "reconstruct", "ReconstructConfig"),
+    "calibrate": ("catacaustics.capture.calibrate", "calibrate", "CalibrateConfig"),
+    "train": ("catacaustics.training.loop", "train", "TrainConfig"),
+    "evaluate": ("catacaustics.evaluation", "evaluate", "EvaluateConfig"),
+    "render": ("catacaustics.video", "render_video", "RenderConfig"),
+    "doctor": ("catacaustics.doctor", "doctor", "DoctorConfig"),
+}
+
+
+def _help() -> str:
+    config = importlib.import_module("catacaustics.config")
+    lines = [
+        "usage: catacaustics COMMAND ...",
+        "",
+        "Photographs of shiny objects in, scenes to look around in out.",
+        "",
+    ]
+    for command, (_, _, name) in _COMMANDS.items():
+        lines.append(f"  {command:<12} {getattr(config, name).__doc__.splitlines()[0]}")
+    return "\n".join([*lines, "", "`catacaustics COMMAND --help` lists a command's options."])
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run one command; returns the exit status: 0, 2 for bad input, 130 when interrupted."""
+    arguments = sys.argv[1:] if arguments is None else arguments
+    if not arguments or arguments[0] in ("-h", "--help", "help"):
+        print(_help())
+        return 0
+    if arguments[0] == "--version":
+        print(importlib.import_module("catacaustics").__version__)
+        return 0
+    command = arguments[0]
+    if command not in _COMMANDS:
+        print(f"catacaustics: there is no command '{command}'\n\n{_help()}", file=sys.stderr)
+        return 2
+    import tyro
+
+    module, function, name = _COMMANDS[command]
+    config_type = getattr(importlib.import_module("catacaustics.config"), name)
+    config = tyro.cli(tyro.conf.PositionalRequiredArgs[config_type], prog=f"catacaustics {command}", args=arguments[1:])
+    try:
+        getattr(importlib.import_module(module), function)(config)
+    except UserError as error:
+        print(f"catacaustics {command}: {error}", file=sys.stderr)
+        return 2
+    except KeyboardInterrupt:
+        print(f"catacaustics {command}: interrupted; finished work is kept", file=sys.stderr)
+        return 130
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

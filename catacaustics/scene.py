@@ -1,0 +1,311 @@
+"""The scene: point clouds, warps, environment and renderer; rendered from any camera, saved to one file.
+
+Primary points carry 6 features and rho, the weight of the reflection, which is splatted as a 7th channel so that
+nearer diffuse occluders hide the reflector. Primary features are scaled by 1 - rho, reflection features by rho. The
+environment map is blended with the primary cloud's transmittance. (Paper sections 4 and 5; the sense of rho is ours.)
+"""
+
+import json
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from catacaustics.cameras import Camera, Viewport, pixel_centers
+from catacaustics.config import SplatConfig
+from catacaustics.environment import EnvironmentMap
+from catacaustics.errors import UserError
+from catacaustics.files import atomic_path
+from catacaustics.reflectors.volume import ReflectionVolume
+from catacaustics.reflectors.warps import NeuralWarp, StaticWarp
+from catacaustics.renderer import FEATURES, NeuralRenderer
+from catacaustics.shapes import Float
+from catacaustics.splatting import SplatOutput, points_in_view, splat_points
+
+FORMAT = 1
+
+
+class PointParameters(nn.Module):
+    """A trainable cloud of oriented disks. Opacities and rho are kept as logits, footprints as logarithms.
+
+    Args:
+        positions, normals: (n, 3), trainable only where `trainable_geometry`.
+        footprints: (n,) squared radii.
+        opacities: (n,) in (0, 1).
+        features: (n, 6).
+        rho: (n,) weight of the reflection in (0, 1), for primary points.
+    """
+
+    def __init__(
+        self,
+        positions: Float[Tensor, "n 3"],
+        normals: Float[Tensor, "n 3"],
+        footprints: Float[Tensor, "n"],
+        opacities: Float[Tensor, "n"],
+        features: Float[Tensor, "n 6"],
+        rho: Float[Tensor, "n"] | None = None,
+        trainable_geometry: bool = True,
+    ):
+        super().__init__()
+        self.positions = nn.Parameter(positions, requires_grad=trainable_geometry)
+        self.normals = nn.Parameter(normals, requires_grad=trainable_geometry)
+        self.log_footprints = nn.Parameter(torch.log(footprints))
+        self.opacity_logits = nn.Parameter(torch.logit(opacities))
+        self.features = nn.Parameter(features)
+        self.rho_logits = None if rho is None else nn.Parameter(torch.logit(rho))
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+
+class Layers(NamedTuple):
+    """What the splatter made for one view: feature images, rho, transmittances, depth, and the primary splats."""
+
+    primary: Float[Tensor, "height width 6"]
+    reflection: Float[Tensor, "height width 6"]
+    rho: Float[Tensor, "height width"]
+    reflection_transmittance: Float[Tensor, "height width"]
+    transmittance: Float[Tensor, "height width"]
+    depth: Float[Tensor, "height width"]
+    directions: Float[Tensor, "height width 3"]
+    splats: SplatOutput
+
+
+class RenderOutput(NamedTuple):
+    """A rendered view. `primary_rgb` is the scene without reflections, `reflection_rgb` reflections alone, unweighted;
+    `reflection_weight` is rho; `alpha` the opacity of the primary cloud; `depth` its mean depth (0 where empty)."""
+
+    rgb: Float[Tensor, "height width 3"]
+    primary_rgb: Float[Tensor, "height width 3"]
+    reflection_rgb: Float[Tensor, "height width 3"]
+    reflection_weight: Float[Tensor, "height width"]
+    alpha: Float[Tensor, "height width"]
+    depth: Float[Tensor, "height width"]
+
+
+class Scene(nn.Module):
+    """A trained or trainable scene. Clouds, warps and volumes of reflector i have index i.
+
+    Args:
+        primary: the primary cloud, with rho.
+        reflections: one cloud a reflector.
+        warps: one warp a reflector (reflectors/warps.py).
+        volumes: one reflection volume a reflector.
+        environment: features by direction, or None.
+        renderer: decodes features to colour.
+        splatting: cut-offs of the splatter.
+    """
+
+    def __init__(
+        self,
+        primary: PointParameters,
+        reflections: list[PointParameters],
+        warps: list[nn.Module],
+        volumes: list[ReflectionVolume],
+        environment: EnvironmentMap | None,
+        renderer: NeuralRenderer,
+        splatting: SplatConfig,
+    ):
+        super().__init__()
+        self.primary = primary
+        self.reflections = nn.ModuleList(reflections)
+        self.warps = nn.ModuleList(warps)
+        self.volumes = volumes
+        self.environment = environment
+        self.renderer = renderer
+        self.splatting = splatting
+
+    @property
+    def device(self) -> torch.device:
+        return self.primary.positions.device
+
+    def layers(self, camera: Camera, viewport: Viewport | None = None, warp_camera: Camera | None = None) -> Layers:
+        """Splat all clouds; differentiable. `warp_camera` decouples what is reflected from where it is seen from."""
+        viewport = viewport or camera.viewport
+        directions = self._directions(camera, viewport)
+        splats = self._splat_primary(camera, viewport)
+        image, through = splats.image, splats.transmittance
+        rho = image[..., FEATURES]
+        primary = image[..., :FEATURES]
+        if self.environment is not None:
+            primary = primary + through[..., None] * self.environment(directions)
+        reflection, reflection_through = self._splat_reflections(camera, viewport, warp_camera or camera)
+        alpha = 1 - through
+        depth = image[..., FEATURES + 1] / torch.where(alpha > 1e-4, alpha, torch.inf)
+        return Layers(primary, reflection, rho, reflection_through, through, depth, directions, splats)
+
+    def decode(self, layers: Layers) -> Float[Tensor, "height width 3"]:
+        """RGB of splatted layers, not clamped: training needs the gradient outside [0, 1] too."""
+        weight = layers.rho[..., None]
+        return self.renderer((1 - weight) * layers.primary, weight * layers.reflection, layers.directions)
+
+    def render(
+        self, camera: Camera, viewport: Viewport | None = None, warp_camera: Camera | None = None
+    ) -> RenderOutput:
+        """Render a view in [0, 1] with the layers people look at (no gradients)."""
+        with torch.no_grad():
+            layers = self.layers(camera, viewport, warp_camera)
+            nothing = torch.zeros_like(layers.primary)
+            return RenderOutput(
+                self.decode(layers).clamp(0, 1),
+                self.renderer(layers.primary, nothing, layers.directions).clamp(0, 1),
+                self.renderer(nothing, layers.reflection, layers.directions).clamp(0, 1),
+                layers.rho,
+                1 - layers.transmittance,
+                layers.depth,
+            )
+
+    def _directions(self, camera: Camera, viewport: Viewport) -> Tensor:
+        rays = torch.from_numpy(camera.ray_directions(pixel_centers(viewport))).to(self.primary.positions)
+        return torch.nn.functional.normalize(rays, dim=-1)
+
+    def _splat_primary(self, camera: Camera, viewport: Viewport) -> SplatOutput:
+        cloud = self.primary
+        with torch.no_grad():
+            footprints = cloud.log_footprints.exp()
+        near = points_in_view(cloud.positions.detach(), footprints, camera, viewport, self.splatting)
+        positions, normals, log_footprints, logits, features = _rows(cloud, near)
+        forward = torch.tensor(camera.camera_from_world[2], dtype=positions.dtype, device=self.device)
+        depth = positions.detach() @ forward[:3] + forward[3]
+        assert cloud.rho_logits is not None
+        rho = torch.sigmoid(cloud.rho_logits.index_select(0, near))
+        output = splat_points(
+            positions,
+            torch.nn.functional.normalize(normals, dim=1),
+            log_footprints.exp(),
+            torch.sigmoid(logits),
+            torch.cat([features, rho[:, None], depth[:, None]], 1),
+            camera,
+            viewport,
+            self.splatting,
+        )
+        return output._replace(visible=near[output.visible])
+
+    def _splat_reflections(self, camera: Camera, viewport: Viewport, warp_camera: Camera) -> tuple[Tensor, Tensor]:
+        """All reflection clouds over each other, nearer reflectors first. Their disks face the camera: a reflection
+        has a place and a size, but no orientation of its own."""
+        like = self.primary.positions
+        image = like.new_zeros(viewport.height, viewport.width, FEATURES)
+        through = like.new_ones(viewport.height, viewport.width)
+        center = torch.tensor(camera.center, dtype=like.dtype, device=like.device)
+        warp_center = torch.tensor(warp_camera.center, dtype=like.dtype, device=like.device)
+        distances = [float(np.linalg.norm(v.center - camera.center)) for v in self.volumes]
+        for i in np.argsort(distances, kind="stable"):
+            cloud, warp = self.reflections[i], self.warps[i]
+            with torch.no_grad():
+                displayed = warp(cloud.positions, warp_center)
+                near = points_in_view(displayed, cloud.log_footprints.exp(), camera, viewport, self.splatting)
+            # Only points that can land in the viewport are warped with gradients.
+            positions, _, log_footprints, logits, features = _rows(cloud, near)
+            positions = warp(positions, warp_center)
+            output = splat_points(
+                positions,
+                torch.nn.functional.normalize(center - positions.detach(), dim=1),
+                log_footprints.exp(),
+                torch.sigmoid(logits),
+                features,
+                camera,
+                viewport,
+                self.splatting,
+            )
+            image = image + through[..., None] * output.image
+            through = through * output.transmittance
+        return image, through
+
+    def save(self, path: Path, extra: dict[str, Tensor] | None = None, notes: dict | None = None) -> None:
+        """Write the scene, atomically, as one safetensors file; `extra` tensors and JSON `notes` travel along."""
+        from safetensors.torch import save_file
+
+        tensors = {f"scene.{k}": v.detach().contiguous().cpu() for k, v in self.state_dict().items()}
+        for i, volume in enumerate(self.volumes):
+            tensors[f"volumes.{i}.halfspaces"] = torch.from_numpy(np.ascontiguousarray(volume.halfspaces))
+            tensors[f"volumes.{i}.vertices"] = torch.from_numpy(np.ascontiguousarray(volume.vertices))
+            tensors[f"volumes.{i}.faces"] = torch.from_numpy(np.ascontiguousarray(volume.faces))
+        tensors |= {k: v.detach().contiguous().cpu() for k, v in (extra or {}).items()}
+        header = {
+            "format": FORMAT,
+            "reflectors": [v.name for v in self.volumes],
+            "splatting": vars(self.splatting),
+            "notes": notes or {},
+        }
+        with atomic_path(path) as temporary:
+            save_file(tensors, temporary, {"catacaustics": json.dumps(header)})
+
+    @staticmethod
+    def load(path: Path, device: str | torch.device = "cpu") -> "Scene":
+        """Read a scene; raises UserError where the file is missing, cut off or of another format."""
+        return Scene.load_with_extras(path, device)[0]
+
+    @staticmethod
+    def load_with_extras(path: Path, device: str | torch.device = "cpu") -> tuple["Scene", dict[str, Tensor], dict]:
+        """A scene with the extra tensors and notes that were saved along."""
+        tensors, header = _read_file(Path(path))
+        parts = {k.removeprefix("scene."): tensors.pop(k) for k in list(tensors) if k.startswith("scene.")}
+        volumes = [
+            ReflectionVolume(
+                name, *(tensors.pop(f"volumes.{i}.{k}").numpy() for k in ("halfspaces", "vertices", "faces"))
+            )
+            for i, name in enumerate(header["reflectors"])
+        ]
+        scene = _from_state(parts, volumes, SplatConfig(**header["splatting"])).to(device)
+        return scene, tensors, header["notes"]
+
+
+def _rows(cloud: PointParameters, index: Tensor) -> list[Tensor]:
+    parts = (cloud.positions, cloud.normals, cloud.log_footprints, cloud.opacity_logits, cloud.features)
+    return [t.index_select(0, index) for t in parts]
+
+
+def _read_file(path: Path) -> tuple[dict[str, Tensor], dict]:
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, "pt") as file:
+            header = json.loads((file.metadata() or {}).get("catacaustics", "{}"))
+            tensors = {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118 (not a dict)
+    except FileNotFoundError as error:
+        raise UserError(f"There is no scene {path}.", "a file made by `catacaustics train`", "train first") from error
+    except (SafetensorError, OSError, ValueError) as error:
+        raise UserError(
+            f"{path} is not a complete scene file: {error}.",
+            "a safetensors file made by `catacaustics train`",
+            "restore it, or train again with --resume: the last checkpoint is kept beside it",
+        ) from error
+    if header.get("format") != FORMAT:
+        raise UserError(
+            f"{path} has scene format {header.get('format')}.", f"format {FORMAT}", "train again with this version"
+        )
+    return tensors, header
+
+
+def _from_state(state: dict[str, Tensor], volumes: list[ReflectionVolume], splatting: SplatConfig) -> Scene:
+    """Build modules of the sizes that the tensors have, then fill them."""
+
+    def cloud(prefix: str, trainable: bool) -> PointParameters:
+        n = len(state[f"{prefix}.positions"])
+        half = torch.full((n,), 0.5)
+        rho = half.clone() if f"{prefix}.rho_logits" in state else None
+        return PointParameters(
+            torch.zeros(n, 3), torch.zeros(n, 3), half, half.clone(), torch.zeros(n, FEATURES), rho, trainable
+        )
+
+    warps: list[nn.Module] = []
+    for i in range(len(volumes)):
+        first = state.get(f"warps.{i}.network.0.weight")
+        if first is None:
+            warps.append(StaticWarp())
+        else:
+            layers = sum(k.startswith(f"warps.{i}.network.") and k.endswith("weight") for k in state) - 1
+            warps.append(NeuralWarp(torch.zeros(3), torch.ones(3), layers, len(first)))
+    environment = None
+    if "environment.features" in state:
+        _, height, width = state["environment.features"].shape
+        environment = EnvironmentMap(width, height)
+    blocks = {k.split(".")[3] for k in state if k.startswith("renderer.decoder.blocks.")}
+    renderer = NeuralRenderer(len(state["renderer.decoder.input.bias"]), 1 + 2 * len(blocks))
+    reflections = [cloud(f"reflections.{i}", False) for i in range(len(volumes))]
+    scene = Scene(cloud("primary", True), reflections, warps, volumes, environment, renderer, splatting)
+    scene.load_state_dict(state)
+    return scene

@@ -1,0 +1,275 @@
+"""Training (paper section 5): multi-resolution warm-up, then everything; progress, checkpoints, resume."""
+
+import json
+import time
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+from tqdm import tqdm
+
+from catacaustics.capture.dataset import Capture, open_capture
+from catacaustics.config import TrainConfig
+from catacaustics.errors import UserError
+from catacaustics.files import write_json
+from catacaustics.losses import coverage_loss, dssim, total_variation, weight_loss
+from catacaustics.reflectors.volume import ReflectionVolume, build_volume
+from catacaustics.scene import Layers, Scene
+from catacaustics.training.densification import GradientStatistics, densify
+from catacaustics.training.initialize import (
+    Seeds,
+    grow_cloud,
+    initial_scene,
+    primary_seeds,
+    reflection_seeds,
+    scene_extent,
+    stage_count,
+)
+from catacaustics.training.optimizer import make_optimizer, optimizer_tensors, restore_optimizer, set_rates
+from catacaustics.training.photographs import PhotographCache, choose_patch, scaled_camera
+
+_LOG_EVERY = 10
+
+
+class Stage(NamedTuple):
+    """Until `end` (share of the training), images at `scale` and the first `points` share of every cloud."""
+
+    end: float
+    scale: float
+    points: float
+
+
+STAGES = (Stage(0.1, 0.25, 1 / 32), Stage(0.25, 0.5, 1 / 6), Stage(1.0, 1.0, 1.0))
+"""Multi-resolution warm-up: from 1/4 resolution and 1 point in 32, doubled twice (paper section 5.2)."""
+
+
+@dataclass
+class TrainState:
+    """Everything that a checkpoint keeps."""
+
+    scene: Scene
+    optimizer: torch.optim.AdamW
+    rng: np.random.Generator
+    step: int = 0
+    seconds: float = 0.0
+    stage: int = 0
+    queue: list[int] = field(default_factory=list)
+
+
+def train(config: TrainConfig) -> Scene:
+    """Train a scene; writes RUN/scene.safetensors and keeps RUN/checkpoint.safetensors while at it.
+
+    Raises:
+        UserError: no capture, no volume, an unfinished run without --resume, or a value that is not finite.
+        KeyboardInterrupt: after the checkpoint was saved.
+    """
+    run = Path(config.run)
+    capture = open_capture(config.capture)
+    finished = run / "scene.safetensors"
+    if finished.exists() and config.resume:
+        print(f"training: {finished} is finished already, kept")
+        return Scene.load(finished, _device(config))
+    if not config.resume and (finished.exists() or (run / "checkpoint.safetensors").exists()):
+        raise UserError(
+            f"{run} already holds a run.", "an empty folder", "add --resume to go on, or choose another folder"
+        )
+    volumes = [build_volume(capture, name) for name in capture.reflectors]
+    if not volumes:
+        print("training: the capture has no masks, so no reflector; the primary cloud is trained alone")
+    rng = np.random.default_rng(config.seed)
+    seeds = [primary_seeds(capture, volumes, config, rng)]
+    if config.warp != "none":
+        seeds += [reflection_seeds(capture, v, config, rng) for v in volumes]
+    write_json(run / "config.json", {k: str(v) if isinstance(v, Path) else v for k, v in asdict(config).items()})
+    state = _start(capture, volumes, seeds, config, rng)
+    try:
+        _loop(state, capture, volumes, seeds, config)
+    except KeyboardInterrupt:
+        save_checkpoint(run, state)
+        print(f"training: interrupted at step {state.step}, checkpoint saved; go on with --resume")
+        raise
+    save_checkpoint(run, state)
+    state.scene.save(finished)
+    return state.scene
+
+
+def _device(config: TrainConfig) -> torch.device:
+    automatic = "cuda" if torch.cuda.is_available() else "cpu"
+    return torch.device(automatic if config.device == "auto" else config.device)
+
+
+def _start(
+    capture: Capture,
+    volumes: list[ReflectionVolume],
+    seeds: list[Seeds],
+    config: TrainConfig,
+    rng: np.random.Generator,
+) -> TrainState:
+    path = Path(config.run) / "checkpoint.safetensors"
+    if not path.exists():
+        scene = initial_scene(capture, volumes, seeds, STAGES[0].points, config).to(_device(config))
+        (Path(config.run) / "metrics.jsonl").unlink(missing_ok=True)
+        return TrainState(scene, make_optimizer(scene, config), rng)
+    scene, tensors, notes = Scene.load_with_extras(path, _device(config))
+    optimizer = make_optimizer(scene, config)
+    restore_optimizer(optimizer, tensors)
+    rng.bit_generator.state = notes["rng"]
+    _trim_log(Path(config.run), notes["step"])
+    print(f"training: going on from step {notes['step']}")
+    return TrainState(scene, optimizer, rng, notes["step"], notes["seconds"], notes["stage"], notes["queue"])
+
+
+def save_checkpoint(run: Path, state: TrainState) -> None:
+    """Scene, Adam's moments, random state and place in the schedule, in one atomic file."""
+    notes = {
+        "step": state.step,
+        "seconds": state.seconds,
+        "stage": state.stage,
+        "queue": state.queue,
+        "rng": state.rng.bit_generator.state,
+    }
+    state.scene.save(run / "checkpoint.safetensors", optimizer_tensors(state.optimizer), notes)
+
+
+def _trim_log(run: Path, step: int) -> None:
+    """Drop what was logged after the checkpoint: those steps are done again."""
+    path = run / "metrics.jsonl"
+    if path.exists():
+        rows = [line for line in path.read_text().splitlines() if line.endswith("}")]
+        path.write_text("".join(line + "\n" for line in rows if json.loads(line)["step"] <= step))
+
+
+def _progress(state: TrainState, config: TrainConfig) -> float:
+    by_step = state.step / config.iterations
+    return max(by_step, state.seconds / (60 * config.minutes)) if config.minutes else by_step
+
+
+def _loop(
+    state: TrainState, capture: Capture, volumes: list[ReflectionVolume], seeds: list[Seeds], config: TrainConfig
+) -> None:
+    run = Path(config.run)
+    photographs = PhotographCache(capture)
+    extent = scene_extent(capture)
+    statistics = GradientStatistics(len(state.scene.primary), state.scene.device)
+    started, saved = time.monotonic() - state.seconds, time.monotonic()
+    bar = tqdm(total=1000, initial=int(1000 * _progress(state, config)), unit="‰", desc="training", mininterval=1.0)
+    with bar, (run / "metrics.jsonl").open("a") as log:
+        while (progress := _progress(state, config)) < 1:
+            _enter_stage(state, progress, seeds, config)
+            stage = STAGES[state.stage]
+            warm_up = state.stage < len(STAGES) - 1
+            set_rates(state.optimizer, config, extent, progress, warm_up)
+            if len(statistics.length) != len(state.scene.primary):
+                statistics = GradientStatistics(len(state.scene.primary), state.scene.device)
+            record = _step(state, capture, volumes, photographs, stage, statistics, config)
+            state.step += 1
+            if config.densify_every and not warm_up and state.step % config.densify_every == 0 and progress < 0.8:
+                densify(state.scene, state.optimizer, statistics, config.densify_share, config.max_primary_points)
+            state.seconds = time.monotonic() - started
+            if state.step % _LOG_EVERY == 0:
+                log.write(json.dumps(_log_row(state, stage, record)) + "\n")
+                log.flush()
+                bar.set_postfix(step=state.step, loss=f"{record['loss']:.4f}", psnr=f"{record['psnr']:.2f}")
+                bar.update(int(1000 * min(_progress(state, config), 1)) - bar.n)
+            if time.monotonic() - saved > 60 * config.checkpoint_minutes:
+                save_checkpoint(run, state)
+                saved = time.monotonic()
+
+
+def _log_row(state: TrainState, stage: Stage, record: dict[str, float]) -> dict:
+    return {
+        "step": state.step,
+        "seconds": round(state.seconds, 2),
+        "stage": state.stage,
+        "scale": stage.scale,
+        **{k: round(v, 6) for k, v in record.items()},
+        "primary_points": len(state.scene.primary),
+        "reflection_points": sum(len(c.positions) for c in state.scene.reflections),
+    }
+
+
+def _enter_stage(state: TrainState, progress: float, seeds: list[Seeds], config: TrainConfig) -> None:
+    """Grow the clouds when progress passes a stage's end. Adam starts anew: its moments belong to other rows."""
+    index = next(i for i, s in enumerate(STAGES) if progress < s.end)
+    if index == state.stage:
+        return
+    scene = state.scene
+    share = STAGES[index].points
+    scene.primary = grow_cloud(scene.primary, seeds[0], stage_count(seeds[0], share))
+    for i, cloud_seeds in enumerate(seeds[1:]):
+        scene.reflections[i] = grow_cloud(scene.reflections[i], cloud_seeds, stage_count(cloud_seeds, share))
+    state.optimizer = make_optimizer(scene, config)
+    state.stage = index
+
+
+def _step(
+    state: TrainState,
+    capture: Capture,
+    volumes: list[ReflectionVolume],
+    photographs: PhotographCache,
+    stage: Stage,
+    statistics: GradientStatistics,
+    config: TrainConfig,
+) -> dict[str, float]:
+    """One optimiser step over `accumulate` patches; returns the mean of what was measured."""
+    scene = state.scene
+    state.optimizer.zero_grad(set_to_none=True)
+    records = []
+    for _ in range(config.accumulate):
+        if not state.queue:
+            state.queue = state.rng.permutation(len(capture.train)).tolist()
+        view = capture.train[state.queue.pop()]
+        camera = scaled_camera(view.camera, config.image_size, stage.scale)
+        viewport = choose_patch(camera, volumes, config.patch, config.reflector_share, state.rng)
+        image = photographs.get(view, camera.width, camera.height)
+        x0, y0, width, height = viewport
+        patch = np.ascontiguousarray(image[y0 : y0 + height, x0 : x0 + width])
+        target = torch.from_numpy(patch).to(scene.device).float() / 255
+        layers = scene.layers(camera, viewport)
+        if layers.splats.screen.requires_grad:
+            layers.splats.screen.retain_grad()
+        masks = [torch.from_numpy(v.project_mask(camera, viewport)).to(scene.device) for v in scene.volumes]
+        losses, psnr = _losses(scene, layers, target, masks, config)
+        total = torch.stack(list(losses.values())).sum() / config.accumulate
+        _check_finite(scene, total, state.step, "loss")
+        total.backward()
+        statistics.add_screen(layers.splats)
+        records.append(
+            {"loss": total.item() * config.accumulate, "psnr": psnr} | {k: v.item() for k, v in losses.items()}
+        )
+    if scene.primary.positions.grad is not None:
+        statistics.direction += scene.primary.positions.grad
+    state.optimizer.step()
+    return {k: float(np.mean([r[k] for r in records])) for k in records[0]}
+
+
+def _losses(
+    scene: Scene, layers: Layers, target: Tensor, masks: list[Tensor], config: TrainConfig
+) -> tuple[dict[str, Tensor], float]:
+    rgb = scene.decode(layers)
+    losses = {
+        "l1": config.weight_l1 * (rgb - target).abs().mean(),
+        "dssim": config.weight_dssim * dssim(rgb, target),
+    }
+    if masks:
+        inside = torch.stack(masks).any(0)
+        losses["coverage"] = config.weight_coverage * coverage_loss(layers.reflection_transmittance, inside)
+        losses["rho"] = config.weight_rho * weight_loss(layers.rho, inside)
+        losses["tv"] = config.weight_tv * total_variation(layers.rho)
+    error = ((rgb.detach().clamp(0, 1) - target) ** 2).mean().item()
+    return losses, float(-10 * np.log10(max(error, 1e-10)))
+
+
+def _check_finite(scene: Scene, loss: Tensor, step: int, name: str) -> None:
+    if torch.isfinite(loss):
+        return
+    bad = [n for n, p in scene.named_parameters() if not torch.isfinite(p).all()]
+    where = f"; the parameter {bad[0]} is not finite either" if bad else ""
+    raise UserError(
+        f"The {name} is not finite at step {step}{where}.",
+        "finite numbers",
+        "the last checkpoint is kept: lower the learning rates and go on with --resume, or report the capture",
+    )
