@@ -1,0 +1,178 @@
+"""Held-out evaluation of a trained scene: metrics.json for programs, report.html for people."""
+
+import time
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+import catacaustics
+from catacaustics.cameras import Camera
+from catacaustics.capture.dataset import Capture, View
+from catacaustics.config import EvaluateConfig
+from catacaustics.errors import UserError
+from catacaustics.files import write_json, write_text
+from catacaustics.images import RESIZE_FILTER, resize
+from catacaustics.metrics import PROTOCOL, Metrics, compare, lpips_missing, mean_metrics
+from catacaustics.report import ReportView, report_html, report_view
+from catacaustics.run import Run, open_run, read_log
+from catacaustics.scene import RenderOutput, Scene
+from catacaustics.shapes import Bool
+from catacaustics.training.photographs import scaled_camera
+
+
+def evaluate(config: EvaluateConfig) -> dict[str, Any]:
+    """Render every held-out view at the training resolution and measure it; writes RUN/metrics.json, RUN/report.html.
+
+    Prints the table of means and returns what metrics.json holds.
+
+    Raises:
+        UserError: no finished run, no capture, no held-out views, or a render that is not finite.
+    """
+    return evaluate_run(open_run(config.run, config.capture, config.device), config.shown_views)
+
+
+def evaluate_run(run: Run, shown_views: int = 12) -> dict[str, Any]:
+    """As `evaluate`, for a run that is open already."""
+    views = run.capture.held_out
+    if not views:
+        raise UserError(
+            f"{run.capture.root} holds out no views.",
+            "at least one held-out view to measure on",
+            "name some under held_out in its split.json (delete the file for every 8th view) and train again",
+        )
+    shown = set(np.linspace(0, len(views) - 1, min(shown_views, len(views))).round().astype(int).tolist())
+    rows, pictures = [], []
+    for i, view in enumerate(tqdm(views, desc="evaluation", unit="view")):
+        row, picture = _measure(run, view, i in shown)
+        rows.append(row)
+        if picture is not None:
+            pictures.append(picture)
+    result = {"mean": _means(rows), "protocol": _protocol(run, rows), "views": rows}
+    write_json(run.folder / "metrics.json", result)
+    log, skipped = read_log(run.folder)
+    html = report_html(run.folder, run.capture.root, run.config, result, pictures, log, skipped)
+    write_text(run.folder / "report.html", html)
+    print(format_table(result))
+    print(f"report: {run.folder / 'report.html'}")
+    return result
+
+
+def format_table(result: dict[str, Any]) -> str:
+    """The means of an evaluation as a plain-text table."""
+    names = {"whole": "whole image", "inside": "inside the reflector"}
+    lines = [f"{'held-out views: ' + str(len(result['views'])):<22}{'PSNR':>9}{'SSIM':>9}{'FLIP':>9}"]
+    for key, name in names.items():
+        m = result["mean"][key]
+        if m is not None:
+            lines.append(f"{name:<22}{m['psnr']:>6.2f} dB{m['ssim']:>9.4f}{m['flip']:>9.4f}")
+    return "\n".join(lines)
+
+
+def reflector_mask(
+    scene: Scene, capture: Capture, view: View, camera: Camera
+) -> tuple[Bool[np.ndarray, "height width"] | None, str]:
+    """Union of the reflectors in a view, and where it came from: "painted", "projected", "both" or "none".
+
+    Each reflector's painted mask is taken where the view has one, its projected volume elsewhere.
+
+    Args:
+        camera: the view's camera at the wanted size.
+    """
+    masks, sources = [], set()
+    volumes = {volume.name: volume for volume in scene.volumes}
+    for name in sorted({*capture.reflectors, *volumes}):
+        painted = capture.mask(view, name)
+        if painted is not None:
+            masks.append(resize(painted.astype(np.float32), camera.width, camera.height) > 0.5)
+            sources.add("painted")
+        elif name in volumes:
+            masks.append(volumes[name].project_mask(camera))
+            sources.add("projected")
+    if not masks:
+        return None, "none"
+    return np.logical_or.reduce(masks), "both" if len(sources) == 2 else sources.pop()
+
+
+def _measure(run: Run, view: View, shown: bool) -> tuple[dict[str, Any], ReportView | None]:
+    """The row of a view in metrics.json and, where it is shown, its pictures."""
+    camera = scaled_camera(view.camera, run.config["image_size"], 1)
+    output, seconds = _timed_render(run.scene, camera)
+    render = output.rgb.numpy()
+    if not np.isfinite(render).all():
+        raise UserError(
+            f"The render of {view.name} has {np.count_nonzero(~np.isfinite(render))} values that are not finite.",
+            "a trained scene",
+            "train again from an earlier checkpoint or with lower learning rates",
+        )
+    photo = resize(run.capture.image(view), camera.width, camera.height).astype(np.float32) / 255
+    mask, source = reflector_mask(run.scene, run.capture, view, camera)
+    comparison = compare(render, photo, mask)
+    row = {
+        "name": view.name,
+        "whole": comparison.whole.as_dict(),
+        "inside": comparison.inside.as_dict() if comparison.inside else None,
+        "mask": source,
+        "mask_share": float(mask.mean()) if mask is not None else 0.0,
+        "width": camera.width,
+        "height": camera.height,
+        "seconds": seconds,
+    }
+    return row, report_view(row, photo, output, comparison.flip_map, mask) if shown else None
+
+
+def _timed_render(scene: Scene, camera: Camera) -> tuple[RenderOutput, float]:
+    """A view on the CPU and the seconds that rendering took, transfer not counted."""
+    with torch.no_grad():
+        start = time.perf_counter()
+        output = scene.render(camera)
+        if scene.device.type == "cuda":
+            torch.cuda.synchronize()
+        seconds = time.perf_counter() - start
+        return RenderOutput(*(layer.float().cpu() for layer in output)), seconds
+
+
+def _means(rows: list[dict[str, Any]]) -> dict[str, Any]:
+    inside = [Metrics(**row["inside"]) for row in rows if row["inside"]]
+    return {
+        "whole": mean_metrics([Metrics(**row["whole"]) for row in rows]).as_dict(),
+        "inside": mean_metrics(inside).as_dict() if inside else None,
+    }
+
+
+def _protocol(run: Run, rows: list[dict[str, Any]]) -> dict[str, Any]:
+    """Everything that the numbers depend on."""
+    sizes = sorted({(row["width"], row["height"]) for row in rows})
+    sources = {source: sum(row["mask"] == source for row in rows) for source in {row["mask"] for row in rows}}
+    device = run.scene.device
+    return {
+        "split": {"train": len(run.capture.train), "held_out": len(rows)},
+        "resolution": [f"{width} x {height}" for width, height in sizes],
+        "resize_filter": RESIZE_FILTER,
+        "masks": {key: sources[key] for key in sorted(sources)},
+        "views_inside": sum(row["inside"] is not None for row in rows),
+        "metrics": PROTOCOL | {"lpips": lpips_missing() or "VGG-16, whole image (torchmetrics)"},
+        "seconds_per_frame": float(np.median([row["seconds"] for row in rows])),
+        "device": torch.cuda.get_device_name(device) if device.type == "cuda" else _cpu_name(),
+        "versions": {"catacaustics": catacaustics.__version__}
+        | {name: _version(name) for name in ("torch", "torchmetrics", "flip-evaluator")},
+    }
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "unknown"
+
+
+def _cpu_name() -> str:
+    import platform
+
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text().splitlines() if cpuinfo.is_file() else []
+    names = [line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")]
+    return f"{names[0] if names else platform.processor() or 'CPU'}, {torch.get_num_threads()} threads"

@@ -1,0 +1,81 @@
+"""The folder of a training run: config.json, scene.safetensors, metrics.jsonl and checkpoints."""
+
+import json
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from catacaustics.capture.dataset import Capture, open_capture
+from catacaustics.errors import UserError
+from catacaustics.files import read_json
+from catacaustics.scene import Scene
+
+
+class Run(NamedTuple):
+    """A finished run: its folder, the scene, the capture it was trained on and training's config.json."""
+
+    folder: Path
+    scene: Scene
+    capture: Capture
+    config: dict[str, Any]
+
+
+def open_run(folder: Path, capture: Path | None = None, device: str = "auto") -> Run:
+    """Open a run's scene and capture.
+
+    Args:
+        capture: the capture's folder, where it is not the one that config.json names.
+        device: "cpu", "cuda", or "auto": the GPU if there is one.
+
+    Raises:
+        UserError: training has not finished, its config.json is missing or damaged, or the capture is gone.
+    """
+    import torch
+
+    folder = Path(folder)
+    path = folder / "scene.safetensors"
+    if not path.is_file():
+        unfinished = (folder / "checkpoint.safetensors").is_file()
+        raise UserError(
+            f"There is no scene {path}" + (", only a checkpoint: training has not finished." if unfinished else "."),
+            "the folder of a finished training run",
+            "go on with `catacaustics train ... --resume`"
+            if unfinished
+            else "run `catacaustics train`, or check the path",
+        )
+    config = read_json(folder / "config.json")
+    if not isinstance(config, dict) or not isinstance(config.get("image_size"), int) or "capture" not in config:
+        raise UserError(
+            f"{folder / 'config.json'} does not tell the capture and image_size of the training.",
+            "the file that training wrote",
+            "restore it from a copy, or train again",
+        )
+    root = Path(capture) if capture is not None else Path(config["capture"])
+    if not root.is_dir():
+        noted = "" if capture is not None else f", which {folder / 'config.json'} names"
+        raise UserError(
+            f"There is no capture {root.absolute()}{noted}.",
+            "the calibrated capture that the scene was trained on",
+            "give its folder with --capture",
+        )
+    automatic = "cuda" if torch.cuda.is_available() else "cpu"
+    scene = Scene.load(path, automatic if device == "auto" else device)
+    return Run(folder, scene, open_capture(root), config)
+
+
+def read_log(folder: Path) -> tuple[list[dict[str, Any]], int]:
+    """Rows of a run's metrics.jsonl and the number of unreadable lines, which are skipped (training was cut off there).
+
+    A missing file is an empty log.
+    """
+    path = Path(folder) / "metrics.jsonl"
+    rows, skipped = [], 0
+    for line in path.read_text(errors="replace").splitlines() if path.is_file() else []:
+        try:
+            row = json.loads(line)
+        except json.JSONDecodeError:
+            row = None
+        if isinstance(row, dict) and isinstance(row.get("seconds"), int | float):
+            rows.append(row)
+        elif line.strip():
+            skipped += 1
+    return rows, skipped
