@@ -53,6 +53,7 @@ class TrainState:
     scene: Scene
     optimizer: torch.optim.AdamW
     rng: np.random.Generator
+    statistics: GradientStatistics
     step: int = 0
     seconds: float = 0.0
     stage: int = 0
@@ -112,14 +113,19 @@ def _start(
     if not path.exists():
         scene = initial_scene(capture, volumes, seeds, STAGES[0].points, config).to(_device(config))
         (Path(config.run) / "metrics.jsonl").unlink(missing_ok=True)
-        return TrainState(scene, make_optimizer(scene, config), rng)
+        statistics = GradientStatistics(len(scene.primary), scene.device)
+        return TrainState(scene, make_optimizer(scene, config), rng, statistics)
     scene, tensors, notes = Scene.load_with_extras(path, _device(config))
     optimizer = make_optimizer(scene, config)
     restore_optimizer(optimizer, tensors)
+    statistics = GradientStatistics(len(scene.primary), scene.device)
+    for name in vars(statistics):
+        setattr(statistics, name, tensors[f"statistics.{name}"].to(scene.device))
     rng.bit_generator.state = notes["rng"]
     _trim_log(Path(config.run), notes["step"])
     print(f"training: going on from step {notes['step']}")
-    return TrainState(scene, optimizer, rng, notes["step"], notes["seconds"], notes["stage"], notes["queue"])
+    place = (notes[key] for key in ("step", "seconds", "stage", "queue"))
+    return TrainState(scene, optimizer, rng, statistics, *place)
 
 
 def save_checkpoint(run: Path, state: TrainState) -> None:
@@ -131,7 +137,8 @@ def save_checkpoint(run: Path, state: TrainState) -> None:
         "queue": state.queue,
         "rng": state.rng.bit_generator.state,
     }
-    state.scene.save(run / "checkpoint.safetensors", optimizer_tensors(state.optimizer), notes)
+    extra = {f"statistics.{name}": value for name, value in vars(state.statistics).items()}
+    state.scene.save(run / "checkpoint.safetensors", extra | optimizer_tensors(state.optimizer), notes)
 
 
 def _trim_log(run: Path, step: int) -> None:
@@ -153,21 +160,21 @@ def _loop(
     run = Path(config.run)
     photographs = PhotographCache(capture)
     extent = scene_extent(capture)
-    statistics = GradientStatistics(len(state.scene.primary), state.scene.device)
     started, saved = time.monotonic() - state.seconds, time.monotonic()
-    bar = tqdm(total=1000, initial=int(1000 * _progress(state, config)), unit="‰", desc="training", mininterval=1.0)
+    layout = "{desc}: {percentage:3.0f}% |{bar}| {elapsed}, {remaining} left{postfix}"
+    start = int(1000 * _progress(state, config))
+    bar = tqdm(total=1000, initial=start, desc="training", mininterval=1.0, bar_format=layout)
     with bar, (run / "metrics.jsonl").open("a") as log:
         while (progress := _progress(state, config)) < 1:
             _enter_stage(state, progress, seeds, config)
             stage = STAGES[state.stage]
             warm_up = state.stage < len(STAGES) - 1
             set_rates(state.optimizer, config, extent, progress, warm_up)
-            if len(statistics.length) != len(state.scene.primary):
-                statistics = GradientStatistics(len(state.scene.primary), state.scene.device)
-            record = _step(state, capture, volumes, photographs, stage, statistics, config)
+            record = _step(state, capture, volumes, photographs, stage, config)
             state.step += 1
             if config.densify_every and not warm_up and state.step % config.densify_every == 0 and progress < 0.8:
-                densify(state.scene, state.optimizer, statistics, config.densify_share, config.max_primary_points)
+                densify(state.scene, state.optimizer, state.statistics, config.densify_share, config.max_primary_points)
+                state.statistics = GradientStatistics(len(state.scene.primary), state.scene.device)
             state.seconds = time.monotonic() - started
             if state.step % _LOG_EVERY == 0:
                 log.write(json.dumps(_log_row(state, stage, record)) + "\n")
@@ -202,6 +209,7 @@ def _enter_stage(state: TrainState, progress: float, seeds: list[Seeds], config:
     for i, cloud_seeds in enumerate(seeds[1:]):
         scene.reflections[i] = grow_cloud(scene.reflections[i], cloud_seeds, stage_count(cloud_seeds, share))
     state.optimizer = make_optimizer(scene, config)
+    state.statistics = GradientStatistics(len(scene.primary), scene.device)
     state.stage = index
 
 
@@ -211,7 +219,6 @@ def _step(
     volumes: list[ReflectionVolume],
     photographs: PhotographCache,
     stage: Stage,
-    statistics: GradientStatistics,
     config: TrainConfig,
 ) -> dict[str, float]:
     """One optimiser step over `accumulate` patches; returns the mean of what was measured."""
@@ -236,12 +243,12 @@ def _step(
         total = torch.stack(list(losses.values())).sum() / config.accumulate
         _check_finite(scene, total, state.step, "loss")
         total.backward()
-        statistics.add_screen(layers.splats)
+        state.statistics.add_screen(layers.splats)
         records.append(
             {"loss": total.item() * config.accumulate, "psnr": psnr} | {k: v.item() for k, v in losses.items()}
         )
     if scene.primary.positions.grad is not None:
-        statistics.direction += scene.primary.positions.grad
+        state.statistics.direction += scene.primary.positions.grad
     state.optimizer.step()
     return {k: float(np.mean([r[k] for r in records])) for k in records[0]}
 

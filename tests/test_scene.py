@@ -1,0 +1,122 @@
+"""The scene: layers add up, files round trip, bad files are refused."""
+
+import numpy as np
+import pytest
+import torch
+from toy import BALL_CENTER, ball_mask, make_toy_capture, toy_cameras
+
+from catacaustics.cameras import Viewport
+from catacaustics.capture.dataset import open_capture
+from catacaustics.config import TrainConfig
+from catacaustics.errors import UserError
+from catacaustics.reflectors.volume import build_volume
+from catacaustics.scene import Scene
+from catacaustics.training.initialize import initial_scene, primary_seeds, reflection_seeds
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    return open_capture(make_toy_capture(tmp_path_factory.mktemp("toy")))
+
+
+def build(capture, **options):
+    config = TrainConfig(
+        capture.root, capture.root / "run", primary_points=3000, reflection_points=500, environment_width=20, **options
+    )
+    volumes = [build_volume(capture, r) for r in capture.reflectors]
+    rng = np.random.default_rng(0)
+    seeds = [primary_seeds(capture, volumes, config, rng)]
+    if config.warp != "none":
+        seeds += [reflection_seeds(capture, v, config, rng) for v in volumes]
+    return initial_scene(capture, volumes, seeds, 1.0, config)
+
+
+@pytest.fixture(scope="module")
+def scene(capture):
+    scene = build(capture)
+    torch.manual_seed(1)
+    with torch.no_grad():  # an untrained head would hide the network
+        scene.renderer.head.weight.normal_(0, 0.05)
+        scene.environment.features.normal_(0, 0.2)
+    return scene
+
+
+def test_a_viewport_is_a_crop_of_the_whole_render(capture, scene):
+    camera = capture.train[0].camera
+    whole = scene.render(camera)
+    part = scene.render(camera, Viewport(20, 10, 15, 12))
+    for name, a, b in zip(whole._fields, part, whole, strict=True):
+        torch.testing.assert_close(a, b[10:22, 20:35], rtol=1e-4, atol=1e-4, msg=name)
+
+
+def test_the_reflector_carries_the_reflection_weight_and_the_floor_does_not(capture, scene):
+    camera = capture.train[2].camera
+    weight = scene.render(camera).reflection_weight.numpy()
+    mask = ball_mask(camera)
+    assert weight[mask].mean() > 0.6
+    assert weight[~mask].mean() < 0.1
+
+
+def test_a_nearer_diffuse_wall_hides_the_reflection(capture):
+    scene = build(capture)
+    camera = capture.train[0].camera
+    wall = camera.center + 0.4 * (BALL_CENTER - camera.center)
+    with torch.no_grad():
+        chosen = torch.arange(0, len(scene.primary), 2)
+        spread = torch.rand(len(chosen), 3) - 0.5
+        scene.primary.positions[chosen] = torch.tensor(wall, dtype=torch.float32) + 0.5 * spread
+        scene.primary.rho_logits[chosen] = -8.0
+        scene.primary.opacity_logits[chosen] = 4.0
+        scene.primary.log_footprints[chosen] = -5.0
+        features = [f for f in scene.reflections[0].parameters() if f.shape[-1:] == (6,)]
+        before = scene.render(camera).rgb
+        features[0] += 1.0
+        after = scene.render(camera).rgb
+    assert float((after - before).abs().max()) < 0.02
+
+
+def test_depth_is_that_of_the_surface(capture, scene):
+    """A pixel on the floor: the depth of where its ray meets y = 0."""
+    camera = capture.train[0].camera
+    x, y = 32, 44
+    assert not ball_mask(camera)[y, x]
+    ray = camera.ray_directions(np.array([x + 0.5, y + 0.5]))
+    expected = -camera.center[1] / ray[1]
+    assert float(scene.render(camera).depth[y, x]) == pytest.approx(expected, rel=0.02)
+
+
+def test_a_decoupled_warp_camera_changes_reflections_only(capture, scene):
+    camera, other = capture.train[0].camera, capture.train[3].camera
+    with torch.no_grad():
+        scene.warps[0].network[-1].weight *= 50
+    a, b = scene.render(camera), scene.render(camera, warp_camera=other)
+    same = scene.render(camera, warp_camera=camera)
+    assert torch.equal(a.rgb, same.rgb)
+    assert torch.equal(a.primary_rgb, b.primary_rgb)
+    assert float((a.reflection_rgb - b.reflection_rgb).abs().max()) > 0.01
+
+
+@pytest.mark.parametrize("warp", ["none", "static", "neural"])
+def test_a_saved_scene_renders_the_same(capture, tmp_path, warp):
+    scene = build(capture, warp=warp, warp_width=16, renderer_layers=5)
+    scene.save(tmp_path / "scene.safetensors")
+    loaded = Scene.load(tmp_path / "scene.safetensors")
+    camera = toy_cameras(5, 40, 30)[1]
+    for a, b in zip(scene.render(camera), loaded.render(camera), strict=True):
+        assert torch.equal(a, b)
+    assert [v.name for v in loaded.volumes] == ([] if warp == "none" else ["ball"])
+
+
+def test_a_file_that_is_missing_cut_off_or_foreign_is_refused(scene, tmp_path):
+    path = tmp_path / "scene.safetensors"
+    with pytest.raises(UserError, match="There is no scene"):
+        Scene.load(path)
+    scene.save(path)
+    path.write_bytes(path.read_bytes()[:1000])
+    with pytest.raises(UserError, match="not a complete scene file"):
+        Scene.load(path)
+    from safetensors.torch import save_file
+
+    save_file({"a": torch.zeros(1)}, path)
+    with pytest.raises(UserError, match="scene format None"):
+        Scene.load(path)

@@ -1,0 +1,68 @@
+"""A tiny capture that tests make on the spot: a coloured floor and a ball that shows one flat colour, 10 views."""
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from catacaustics.cameras import Camera, pixel_centers
+from catacaustics.capture.dataset import View, open_capture, write_capture
+from catacaustics.geometry import look_at
+from catacaustics.images import write_image
+from catacaustics.points import PointCloud, write_ply
+from catacaustics.splatting import splat_points
+
+BALL_CENTER = np.array([0.0, -0.35, 0.0])
+BALL_RADIUS = 0.35
+BALL_COLOR = np.array([0.9, 0.8, 0.2])
+
+
+def toy_cameras(count: int, width: int, height: int) -> list[Camera]:
+    cameras = []
+    for i in range(count):
+        angle = 2 * np.pi * i / count
+        eye = np.array([2.2 * np.cos(angle), -1.2 - 0.1 * np.sin(3 * angle), 2.2 * np.sin(angle)])
+        pose = look_at(eye, BALL_CENTER, np.array([0.0, -1.0, 0.0]))
+        cameras.append(Camera(width, height, 1.1 * width, 1.1 * width, width / 2, height / 2, pose))
+    return cameras
+
+
+def ball_mask(camera: Camera) -> np.ndarray:
+    """Pixels whose ray meets the ball, in closed form."""
+    rays = camera.ray_directions(pixel_centers(camera.viewport))
+    offset = camera.center - BALL_CENTER
+    a, b, c = (rays**2).sum(-1), rays @ offset, offset @ offset - BALL_RADIUS**2
+    return b**2 - a * c > 0
+
+
+def floor_cloud() -> PointCloud:
+    """Points on y = 0 in four colours that stripe both ways."""
+    grid = np.linspace(-1.5, 1.5, 61)
+    x, z = (g.ravel() for g in np.meshgrid(grid, grid))
+    colors = np.stack([0.5 + 0.4 * np.sin(3 * x), 0.5 + 0.4 * np.cos(4 * z), 0.5 + 0.3 * np.sin(x + 2 * z)], -1)
+    normals = np.broadcast_to([0.0, -1.0, 0.0], (len(x), 3))
+    return PointCloud(*(np.float32(a) for a in (np.stack([x, 0 * x, z], -1), normals, colors)))
+
+
+def make_toy_capture(root: Path, masks: bool = True, points: bool = True, width: int = 64, height: int = 48) -> Path:
+    cloud = floor_cloud()
+    tensors = [torch.from_numpy(a) for a in (cloud.positions, cloud.normals, cloud.colors)]
+    footprints = torch.full((len(cloud),), 0.04**2)
+    views = []
+    for i, camera in enumerate(toy_cameras(10, width, height)):
+        opacities = torch.full((len(cloud),), 0.95)
+        out = splat_points(tensors[0], tensors[1], footprints, opacities, tensors[2], camera)
+        image = out.image.numpy() + 0.3 * out.transmittance.numpy()[..., None]
+        mask = ball_mask(camera)
+        image = np.where(mask[..., None], BALL_COLOR, image)
+        view = View(f"view_{i:02d}.png", camera)
+        write_image(root / "images" / view.name, image)
+        if masks:
+            write_image(root / "masks" / "ball" / view.name, mask)
+        views.append(view)
+    names = [v.name for v in views]
+    write_capture(root, views, {"train": names[:8], "held_out": names[8:]})
+    if points:
+        write_ply(root / "points.ply", cloud)
+    open_capture(root)
+    return root
