@@ -94,9 +94,16 @@ def default_split(names: list[str], every: int = 8) -> dict[str, list[str]]:
     return {"train": [n for n in names if n not in set(held_out)], "held_out": held_out}
 
 
-def write_capture(root: Path, views: list[View], split: dict[str, list[str]]) -> None:
-    """Write the cameras and the split of a capture whose photographs are in images/ already."""
-    write_model(Path(root) / "sparse" / "0", [(v.name, v.camera) for v in views])
+def write_capture(
+    root: Path,
+    views: list[View],
+    split: dict[str, list[str]],
+    points: np.ndarray | None = None,
+    colors: np.ndarray | None = None,
+) -> None:
+    """Write the cameras and the split of a capture whose photographs are in images/ already, and the sparse points
+    (n, 3) and their colours (n, 3) from structure from motion, where there are any."""
+    write_model(Path(root) / "sparse" / "0", [(v.name, v.camera) for v in views], points, colors)
     write_json(Path(root) / "split.json", split)
 
 

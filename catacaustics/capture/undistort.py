@@ -221,7 +221,7 @@ def _source_map(camera: ColmapCamera, pinhole: ColmapCamera) -> tuple[np.ndarray
         y = (np.arange(top, min(top + 64, height)) + 0.5 - c[1]) / f[1]
         source = (distort(camera, np.stack(np.meshgrid(x, y), -1)) - 0.5).astype(np.float32)
         rows = slice(top, top + len(y))
-        coarse[rows], fine[rows] = cv2.convertMaps(source, None, cv2.CV_16SC2)
+        coarse[rows], fine[rows] = cv2.convertMaps(source[..., 0], source[..., 1], cv2.CV_16SC2)
     return coarse, fine
 
 
@@ -390,7 +390,7 @@ def undistort_views(
     for image in tqdm(sorted(model.images, key=lambda i: i.camera_id), "undistort", unit="photo"):
         camera, pinhole, name = model.cameras[image.camera_id], pinholes[image.camera_id], names[image.name]
         same = finished.get(name) == recipes[name]
-        jobs = [(sources[image.name], out / "images" / name, None)]
+        jobs: list[tuple[Path, Path, str | None]] = [(sources[image.name], out / "images" / name, None)]
         for reflector, files in found.items():
             if image.name in files:
                 output = out / "masks" / reflector / Path(name).with_suffix(".png")

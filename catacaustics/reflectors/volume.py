@@ -355,5 +355,6 @@ def build_volume(capture: Capture, reflector: str) -> ReflectionVolume:
         )
     masked = [v for v in capture.train if capture.mask_path(v, reflector).is_file()]
     if len(masked) < 3:
-        masked = [v for v in capture.views if capture.mask_path(v, reflector).is_file()]
-    return volume_from_masks(reflector, [(v.name, v.camera, capture.mask(v, reflector)) for v in masked])
+        masked = capture.views
+    masks = [(v.name, v.camera, capture.mask(v, reflector)) for v in masked]
+    return volume_from_masks(reflector, [(name, camera, mask) for name, camera, mask in masks if mask is not None])
