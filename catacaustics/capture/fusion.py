@@ -120,6 +120,8 @@ def fuse_maps(
     options.min_num_pixels = min_views
     options.max_depth_error = max_depth_error
     options.max_normal_error = max_normal_error
+    # With several threads the result depends on their order.
+    options.num_threads = 1
     masks = Path(workspace) / "masks"
     if masks.is_dir():
         options.mask_path = str(masks)

@@ -5,7 +5,7 @@ q ~ A p + b w(p), with A = K' R K^-1 and b = K' t. A plane in space is an affine
 nothing special: the correlation windows follow the field. The steps:
 
 1. Sweep fronto-parallel planes, even in inverse depth, at a low resolution; the score of a plane is the mean of the
-   best correlations among the neighbours, which tolerates occlusion. Semi-global aggregation (Hirschmueller, PAMI 2008).
+   best correlations among the neighbours, which tolerates occlusion. Semi-global aggregation (Hirschmüller 2008).
 2. At each finer resolution: fit affine pieces to the field, let pixels take over the planes of pixels near by, and move
    each to the peak of its score (parabola), well below the spacing of the planes.
 3. Normals from the affine pieces; pixels without texture or with a low score are dropped, not invented.
@@ -71,7 +71,7 @@ class DepthEstimate(NamedTuple):
 
 
 def _box_mean(x: torch.Tensor, radius: int) -> torch.Tensor:
-    """Mean over windows of 2 r + 1 pixels; the result is smaller by r on each side. Sums by doubling: no rounding drift."""
+    """Mean over windows of 2 r + 1 pixels; smaller by r on each side. Sums by doubling do not drift."""
     window = 2 * radius + 1
     for dim in (-2, -1):
         length = x.shape[dim] - window + 1

@@ -1,14 +1,13 @@
 """Multi-view stereo: a capture's training photographs to one fused cloud with normals.
 
-Depth and normal maps come from COLMAP's PatchMatch where pycolmap has CUDA, and from `plane_sweep` elsewhere; either way
-COLMAP fuses them (`fusion`). The work lies in work/stereo/KEY below the capture, KEY being a digest of everything that
-the maps depend on: an interrupted run goes on where it stopped, and stale maps are never used. Photographs are read when
-needed and only a few are kept, so memory does not grow with their number.
+Depth and normal maps come from COLMAP's PatchMatch where pycolmap has CUDA, and from `plane_sweep` elsewhere; either
+way COLMAP fuses them (`fusion`). The work lies in work/stereo/KEY below the capture, KEY being a digest of everything
+that the maps depend on: an interrupted run goes on where it stopped, and stale maps are never used. Photographs are
+read when needed and only a few are kept, so memory does not grow with their number.
 """
 
 import hashlib
 import json
-import os
 import shutil
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor, as_completed
@@ -21,7 +20,7 @@ import torch
 from tqdm import tqdm
 
 from catacaustics.cameras import Camera, pixel_centers
-from catacaustics.capture.dataset import Capture, View
+from catacaustics.capture.dataset import Capture
 from catacaustics.capture.fusion import (
     fuse_maps,
     import_pycolmap,
