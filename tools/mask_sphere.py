@@ -14,6 +14,7 @@ their poses are):
 """
 
 import argparse
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -113,4 +114,8 @@ def main(arguments: list[str] | None = None) -> None:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except UserError as error:
+        print(error, file=sys.stderr)
+        sys.exit(2)
