@@ -1,0 +1,337 @@
+"""Mitsuba 3: a scene model as a Mitsuba scene, path-traced views, and the exact geometry behind every pixel.
+
+Mitsuba's cameras look along +z with x to the left and y up; ours have x to the right and y down (OpenCV), so that
+world_from_mitsuba = world_from_camera @ diag(-1, -1, 1, 1). Pixel centres are at +0.5 in both.
+"""
+
+import sys
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from catacaustics.cameras import Camera, pixel_centers
+from catacaustics.capture.truth import Truth
+from catacaustics.errors import UserError
+from catacaustics.geometry import rigid_inverse
+from catacaustics.shapes import Bool, Float, Int
+from scene_maker.model import Light, Reflector, SceneModel
+from scene_maker.solids import Mesh, atlas, merged
+
+VARIANTS = ("auto", "cuda_ad_rgb", "llvm_ad_rgb", "scalar_rgb")
+MAX_BOUNCES = 12
+LIGHT_CELL = 4
+"""Side in texels of the cells for which light is path-traced: 1 to 2 cm."""
+SAMPLES_AT_ONCE = 4
+_LLVM_REMEDY = "install the LLVM library (Debian, Ubuntu: `apt-get install -y libllvm15`), or use --variant scalar_rgb"
+
+
+def choose_variant(variant: str = "auto") -> str:
+    """Start Mitsuba with a variant and return its name; `auto` takes the first of CUDA, LLVM and scalar that works.
+
+    Raises:
+        UserError: Mitsuba is missing, or the variant asked for does not work here.
+    """
+    if variant not in VARIANTS:
+        raise UserError(f"There is no variant {variant}.", f"one of {', '.join(VARIANTS)}", "name one of them")
+    try:
+        import mitsuba as mi
+    except ImportError as error:
+        raise UserError(
+            "Mitsuba is not installed.", "the Python package mitsuba", "pip install 'catacaustics[scenes]'"
+        ) from error
+    problems = []
+    for name in VARIANTS[1:] if variant == "auto" else (variant,):
+        try:
+            mi.set_variant(name)
+            np.array(mi.Float(1.0) + 1.0)  # the compiler or driver is looked for only now
+        except (RuntimeError, ImportError) as error:
+            problems.append(f"{name}: {str(error).strip().splitlines()[-1]}")
+            continue
+        if name == "scalar_rgb" and variant == "auto":
+            print(
+                f"No LLVM library found: rendering with scalar_rgb, which is slow. To go faster, {_LLVM_REMEDY}.",
+                file=sys.stderr,
+            )
+        return name
+    remedy = _LLVM_REMEDY if "llvm" in variant else "use --variant auto"
+    raise UserError(f"Mitsuba cannot start {'; '.join(problems)}.", "a working Mitsuba variant", remedy)
+
+
+def _mesh(name: str, mesh: Mesh, bsdf: Any, emitter: Any = None) -> Any:
+    import mitsuba as mi
+
+    properties = mi.Properties()
+    properties["mesh_bsdf"] = bsdf
+    if emitter is not None:
+        properties["mesh_emitter"] = emitter
+    made = mi.Mesh(
+        name,
+        len(mesh.vertices),
+        len(mesh.faces),
+        props=properties,
+        has_vertex_normals=True,
+        has_vertex_texcoords=True,
+    )
+    parameters = mi.traverse(made)
+    parameters["vertex_positions"] = mesh.vertices.astype(np.float32).ravel()
+    parameters["vertex_normals"] = mesh.normals.astype(np.float32).ravel()
+    parameters["vertex_texcoords"] = mesh.uv.astype(np.float32).ravel()
+    parameters["faces"] = mesh.faces.astype(np.uint32).ravel()
+    parameters.update()
+    return made
+
+
+def _linear(texture: np.ndarray) -> np.ndarray:
+    """Linear reflectance of sRGB bytes."""
+    x = np.arange(256) / 255
+    return np.where(x < 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4).astype(np.float32)[texture]
+
+
+def _texture(image: np.ndarray) -> dict[str, Any]:
+    import mitsuba as mi
+
+    return {"type": "bitmap", "bitmap": mi.Bitmap(np.ascontiguousarray(image)), "wrap_mode": "clamp"}
+
+
+def _light(light: Light) -> Any:
+    import mitsuba as mi
+
+    radiance: dict[str, Any] = {"type": "rgb", "value": list(light.radiance)}
+    if light.view is not None:
+        # v runs down a bitmap, but up a rectangle.
+        image = np.ascontiguousarray((light.view[::-1] * np.asarray(light.radiance)).astype(np.float32))
+        radiance = {"type": "bitmap", "bitmap": mi.Bitmap(image), "raw": True, "wrap_mode": "clamp"}
+    # A rectangle is the analytic square [-1, 1]^2 with its front along +z.
+    right, down = np.asarray(light.right, float), np.asarray(light.down, float)
+    matrix = np.eye(4)
+    matrix[:3, 0], matrix[:3, 1] = right / 2, -down / 2
+    matrix[:3, 2] = np.cross(right, -down) / np.linalg.norm(np.cross(right, down))
+    matrix[:3, 3] = np.asarray(light.top_left) + right / 2 + down / 2
+    return {
+        "type": "rectangle",
+        "to_world": mi.ScalarTransform4f(matrix),
+        "emitter": {"type": "area", "radiance": radiance},
+        "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}},
+    }
+
+
+def _reflector(reflector: Reflector) -> Any:
+    import mitsuba as mi
+
+    tint = {"type": "rgb", "value": list(reflector.tint)}
+    if reflector.paint is None:
+        surface: dict[str, Any] = {"type": "conductor", "specular_reflectance": tint}
+    else:
+        surface = {
+            "type": "plastic",
+            "diffuse_reflectance": _texture(reflector.paint),
+            "specular_reflectance": tint,
+            "int_ior": 1.7,
+            "nonlinear": True,
+        }
+    surface = {"type": "twosided", "bsdf": surface}
+    if reflector.geometry["type"] == "sphere":
+        center, radius = reflector.geometry["center"], reflector.geometry["radius"]
+        return {"type": "sphere", "center": center, "radius": radius, "bsdf": surface}
+    assert reflector.mesh is not None, f"the reflector {reflector.name} has no mesh"
+    return _mesh(reflector.name, reflector.mesh, mi.load_dict(surface))
+
+
+@dataclass(frozen=True, eq=False)
+class Hits:
+    """What rays meet: distance (infinite for nothing), position, normal towards the ray's origin, which reflector
+    (or -1), and whether the surface was met from its back."""
+
+    distance: Float[np.ndarray, "n"]
+    position: Float[np.ndarray, "n 3"]
+    normal: Float[np.ndarray, "n 3"]
+    reflector: Int[np.ndarray, "n"]
+    back: Bool[np.ndarray, "n"]
+
+
+class Renderer:
+    """A Mitsuba scene built from a model. `choose_variant` first.
+
+    Light that leaves a diffuse surface is the same in every direction. It is therefore path-traced once for every
+    point of the surfaces (`irradiance`, then `illuminate`) and not again for every view; the views trace what is left:
+    mirrors, glazes and pixels.
+    """
+
+    def __init__(self, model: SceneModel):
+        import mitsuba as mi
+
+        self.model = model
+        self._places = merged(model.surfaces)
+        paint = _texture(atlas(model.surfaces, [s.texture for s in model.surfaces]))
+        self.scene = self._load(
+            _mesh("surroundings", self._places, mi.load_dict({"type": "diffuse", "reflectance": paint}))
+        )
+        self._lit = None
+        by_name = {shape.id(): shape for shape in self.scene.shapes()}
+        self._reflectors = [by_name[f"reflector_{i}"] for i in range(len(model.reflectors))]
+
+    def _load(self, surroundings: Any) -> Any:
+        import mitsuba as mi
+
+        scene: dict[str, Any] = {"type": "scene", "surroundings": surroundings}
+        scene |= {f"light_{i}": _light(light) for i, light in enumerate(self.model.lights)}
+        scene |= {f"reflector_{i}": _reflector(r) for i, r in enumerate(self.model.reflectors)}
+        if self.model.sky is not None:
+            turn = mi.ScalarTransform4f().rotate([1, 0, 0], 90)  # Mitsuba's maps have y up
+            scene["sky"] = {"type": "envmap", "bitmap": mi.Bitmap(self.model.sky), "to_world": turn}
+        return mi.load_dict(scene)
+
+    def irradiance(self, samples: int, seed: int) -> list[Float[np.ndarray, "rows columns 3"]]:
+        """Radiance of each surface were it white, in cells of LIGHT_CELL x LIGHT_CELL texels (irradiance over pi)."""
+        cells = [tuple(-(-n // LIGHT_CELL) for n in s.texture.shape[:2]) for s in self.model.surfaces]
+        found = [s.points(*cell) for s, cell in zip(self.model.surfaces, cells, strict=True)]
+        positions, normals = (np.concatenate([f[k].reshape(-1, 3) for f in found]) for k in (0, 1))
+        light = self._outgoing(positions, normals, samples, seed)
+        parts = np.split(light, np.cumsum([r * c for r, c in cells])[:-1])
+        return [part.reshape(*cell, 3) for part, cell in zip(parts, cells, strict=True)]
+
+    def _outgoing(self, positions: np.ndarray, normals: np.ndarray, samples: int, seed: int) -> np.ndarray:
+        """Path-traced radiance over reflectance at surface points, seen from just in front of them."""
+        import mitsuba as mi
+
+        integrator = mi.load_dict({"type": "path", "max_depth": self.model.max_depth, "rr_depth": 4})
+        sensor = mi.load_dict({"type": "perspective"})
+        total, pixels = np.zeros(positions.shape), len(positions)
+        scalar = mi.variant().startswith("scalar")
+        for start in range(0, samples, SAMPLES_AT_ONCE):
+            count = min(SAMPLES_AT_ONCE, samples - start)
+            eyes = np.repeat(positions + 1e-3 * normals, count, 0)
+            looks = np.repeat(-normals, count, 0)
+            sampler = mi.load_dict({"type": "independent"})
+            sampler.seed(seed * 100003 + start, 1 if scalar else len(eyes))
+            if scalar:
+                light = np.array(
+                    [self._radiance(integrator, sampler, sensor, e, d) for e, d in zip(eyes, looks, strict=True)]
+                )
+            else:
+                light = np.array(self._radiance(integrator, sampler, sensor, eyes.T, looks.T)).T
+            total += light.reshape(pixels, count, 3).sum(1)
+        return total / samples
+
+    def _radiance(self, integrator: Any, sampler: Any, sensor: Any, eye: np.ndarray, look: np.ndarray) -> Any:
+        import drjit as dr
+        import mitsuba as mi
+
+        ray = mi.RayDifferential3f(mi.Point3f(eye.astype(np.float32)), mi.Vector3f(look.astype(np.float32)))
+        hit = self.scene.ray_intersect(ray)
+        white = dr.maximum(hit.bsdf(ray).eval_diffuse_reflectance(hit), 1e-3)
+        light = integrator.sample(self.scene, sampler, ray)[0] / white
+        return dr.select(hit.is_valid() & (hit.t < 2e-3), light, 0)
+
+    def illuminate(self, irradiance: list[Float[np.ndarray, "rows columns 3"]]) -> None:
+        """Make every diffuse surface emit what it reflects."""
+        import cv2
+        import mitsuba as mi
+
+        glow = []
+        for surface, light in zip(self.model.surfaces, irradiance, strict=True):
+            height, width = surface.texture.shape[:2]
+            smooth = cv2.GaussianBlur(light.astype(np.float32), (0, 0), 0.7, borderType=cv2.BORDER_REPLICATE)
+            rows, columns = light.shape[:2]
+            full = cv2.resize(smooth, (columns * LIGHT_CELL, rows * LIGHT_CELL), interpolation=cv2.INTER_LINEAR)
+            full = cv2.resize(full, (width, height), interpolation=cv2.INTER_LINEAR)
+            glow.append(full * _linear(surface.texture))
+        image = mi.Bitmap(atlas(self.model.surfaces, glow))
+        radiance = {"type": "bitmap", "bitmap": image, "raw": True, "wrap_mode": "clamp"}
+        black = mi.load_dict({"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}})
+        emitter = mi.load_dict({"type": "area", "radiance": radiance})
+        self._lit = self._load(_mesh("surroundings", self._places, black, emitter))
+
+    def photograph(self, camera: Camera, samples: int, seed: int) -> Float[np.ndarray, "height width 3"]:
+        """A view as linear radiance times exposure, path-traced with a box filter. `illuminate` first."""
+        import mitsuba as mi
+
+        assert self._lit is not None, "illuminate the scene first"
+        world_from_mitsuba = rigid_inverse(camera.camera_from_world) @ np.diag([-1.0, -1.0, 1.0, 1.0])
+        sensor = mi.load_dict(
+            {
+                "type": "perspective",
+                "fov": float(np.degrees(2 * np.arctan(camera.width / (2 * camera.fx)))),
+                "fov_axis": "x",
+                "near_clip": 0.01,
+                "far_clip": 1000.0,
+                "to_world": mi.ScalarTransform4f(world_from_mitsuba),
+                "sampler": {"type": "independent"},
+                "film": {
+                    "type": "hdrfilm",
+                    "width": camera.width,
+                    "height": camera.height,
+                    "rfilter": {"type": "box"},
+                    "pixel_format": "rgb",
+                    "component_format": "float32",
+                },
+            }
+        )
+        integrator = mi.load_dict({"type": "path", "max_depth": MAX_BOUNCES + 1, "rr_depth": MAX_BOUNCES})
+        image = mi.render(self._lit, sensor=sensor, integrator=integrator, spp=samples, seed=seed)
+        return np.array(image) * self.model.exposure
+
+    def truth(self, camera: Camera) -> tuple[Truth, Int[np.ndarray, "height width"]]:
+        """The exact geometry at every pixel centre, and the index of the reflector seen there (-1: none)."""
+        height, width = camera.height, camera.width
+        directions = camera.ray_directions(pixel_centers(camera.viewport)).reshape(-1, 3)
+        first = self.trace(np.broadcast_to(camera.center, directions.shape), directions)
+        # `directions` have z = 1 in the camera, so that distance along them in units of their length is depth.
+        depth = first.distance / np.linalg.norm(directions, axis=-1)
+        source = self._mirrored(directions, first)
+        found = np.isfinite(depth)
+        truth = Truth(
+            np.where(found, depth, np.nan).reshape(height, width),
+            np.where(found[:, None], first.normal, np.nan).reshape(height, width, 3),
+            source.reshape(height, width, 3),
+            (first.reflector >= 0).reshape(height, width),
+        )
+        return truth, first.reflector.reshape(height, width)
+
+    def _mirrored(self, directions: np.ndarray, first: Hits) -> np.ndarray:
+        """Where the mirrored path of each ray first meets something that is no reflector; nan where it does not."""
+        source = np.full(directions.shape, np.nan)
+        active = np.flatnonzero(first.reflector >= 0)
+        direction, hits = directions[active], Hits(*(v[active] for v in vars(first).values()))
+        for _ in range(MAX_BOUNCES):
+            if not len(active):
+                break
+            direction = direction - 2 * (direction * hits.normal).sum(-1, keepdims=True) * hits.normal
+            start = hits.position + 1e-5 * hits.normal
+            hits = self.trace(start, direction)
+            arrived = np.isfinite(hits.distance) & (hits.reflector < 0)
+            source[active[arrived]] = hits.position[arrived]
+            again = hits.reflector >= 0
+            active, direction = active[again], direction[again]
+            hits = Hits(*(v[again] for v in vars(hits).values()))
+        return source
+
+    def trace(self, origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]) -> Hits:
+        """Meet rays with the scene; directions need not be unit vectors. Normals are the shading normals."""
+        import mitsuba as mi
+
+        directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
+        if mi.variant().startswith("scalar"):
+            rows = [self._intersect(mi.Point3f(o), mi.Vector3f(d)) for o, d in zip(origins, directions, strict=True)]
+            distance, normal, reflector = (np.array(column) for column in zip(*rows, strict=True))
+            normal = normal.reshape(-1, 3)
+        else:
+            o, d = (np.ascontiguousarray(v.T, np.float32) for v in (origins, directions))
+            distance, normal, reflector = (np.array(v) for v in self._intersect(mi.Point3f(o), mi.Vector3f(d)))
+            normal = normal.T
+        distance, normal = distance.astype(float), normal.astype(float)
+        back = (normal * directions).sum(-1) > 0
+        normal = np.where(back[:, None], -normal, normal)
+        finite = np.where(np.isfinite(distance), distance, 0)
+        return Hits(distance, origins + finite[:, None] * directions, normal, reflector.astype(int), back)
+
+    def _intersect(self, origin: Any, direction: Any) -> tuple[Any, Any, Any]:
+        import drjit as dr
+        import mitsuba as mi
+
+        hit = self.scene.ray_intersect(mi.Ray3f(origin, direction))
+        reflector = mi.Int32(-1)
+        for i, shape in enumerate(self._reflectors):
+            reflector = dr.select(hit.is_valid() & (hit.shape == mi.ShapePtr(shape)), i, reflector)
+        return hit.t, hit.sh_frame.n, reflector
