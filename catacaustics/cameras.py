@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from catacaustics.geometry import rigid, rigid_inverse, transform
+from catacaustics.geometry import rigid, rigid_inverse, rotation_angle, transform
 from catacaustics.shapes import Float
 
 
@@ -97,11 +97,15 @@ def pixel_centers(viewport: Viewport) -> Float[np.ndarray, "height width 2"]:
 
 
 def interpolate_path(cameras: Sequence[Camera], frames: int) -> list[Camera]:
-    """A smooth path through the given cameras at even speed: cubic spline of centres, spline of rotations.
+    """A smooth path through the poses of key cameras at even speed.
+
+    Splines of centres (natural cubic) and of rotations over the keys' distances, walked in equal steps. A distance
+    counts translation in units of the keys' mean step and rotation in units of 30 degrees, so a path that only turns
+    advances too. Keys that coincide with the one before are passed once.
 
     Args:
-        cameras: key cameras in order, at least 2; intrinsics and size are the first one's.
-        frames: number of cameras returned; the first and last are the first and last key.
+        cameras: key cameras in order; intrinsics and size of all returned cameras are the first one's.
+        frames: number of cameras returned; the first and last have the poses of the first and last key.
 
     Raises:
         ValueError: fewer than two keys or frames.
@@ -112,15 +116,29 @@ def interpolate_path(cameras: Sequence[Camera], frames: int) -> list[Camera]:
     if len(cameras) < 2 or frames < 2:
         raise ValueError(f"interpolate_path needs 2 or more cameras and frames, got {len(cameras)} and {frames}")
     centers = np.array([c.center for c in cameras])
-    rotations = Rotation.from_matrix(np.array([c.camera_from_world[:3, :3].T for c in cameras]))
-    step = np.linalg.norm(np.diff(centers, axis=0), axis=1)
-    turn = (rotations[:-1].inv() * rotations[1:]).magnitude()
-    # Keys that coincide would break the spline; a path that only turns still advances.
-    time = np.concatenate([[0], np.cumsum(np.maximum(step / max(step.mean(), 1e-12), turn) + 1e-6)])
-    samples = np.linspace(0, time[-1], frames)
-    path_centers = CubicSpline(time, centers)(samples)
-    path_rotations = RotationSpline(time, rotations)(samples).as_matrix()
+    matrices = np.array([c.camera_from_world[:3, :3].T for c in cameras])
+    scale = max(np.linalg.norm(np.diff(centers, axis=0), axis=1).mean(), 1e-12)
+    steps = _pose_steps(centers, matrices, scale)
+    keep = np.concatenate([[True], steps > 1e-4])
+    if keep.sum() < 2:
+        return [cameras[0]] * frames
+    time = np.concatenate([[0], np.cumsum(steps[keep[1:]])])
+    center_spline = CubicSpline(time, centers[keep], bc_type="natural")
+    rotation_spline = RotationSpline(time, Rotation.from_matrix(matrices[keep]))
+    # Even speed: measure the way along the splines and invert it.
+    dense = np.linspace(0, time[-1], 32 * (frames + len(time)))
+    steps = _pose_steps(center_spline(dense), rotation_spline(dense).as_matrix(), scale)
+    way = np.concatenate([[0], np.cumsum(steps)])
+    samples = np.interp(np.linspace(0, way[-1], frames), way, dense)
     return [
         replace(cameras[0], camera_from_world=rigid(r.T, -r.T @ c))
-        for r, c in zip(path_rotations, path_centers, strict=True)
+        for r, c in zip(rotation_spline(samples).as_matrix(), center_spline(samples), strict=True)
     ]
+
+
+def _pose_steps(
+    centers: Float[np.ndarray, "n 3"], world_from_camera: Float[np.ndarray, "n 3 3"], scale: float
+) -> Float[np.ndarray, "n_minus_1"]:
+    """Distances between successive poses: translation over `scale`, and rotation over 30 degrees."""
+    turns = rotation_angle(world_from_camera[:-1].swapaxes(-1, -2) @ world_from_camera[1:])
+    return np.hypot(np.linalg.norm(np.diff(centers, axis=0), axis=1) / scale, turns / np.radians(30))

@@ -113,6 +113,8 @@ class EvaluateConfig:
     """The capture, where it is no longer at the place that training noted."""
     shown_views: int = 12
     """Held-out views with pictures in the report, spread evenly; all of them are measured."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to render; auto takes the GPU if there is one."""
 
 
 @dataclass(frozen=True)
@@ -137,6 +139,8 @@ class RenderConfig:
     """Constant rate factor of H.264: lower is better and larger, 18 is visually lossless."""
     capture: Path | None = None
     """The capture, where it is no longer at the place that training noted."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to render; auto takes the GPU if there is one."""
 
 
 @dataclass(frozen=True)

@@ -66,7 +66,7 @@ def doctor(config: DoctorConfig) -> None:
         ("multi-view stereo", _stereo()),
     ]
     packages = ["torch", "numpy", "scipy", "pycolmap", "open3d", "opencv-contrib-python-headless", "torchmetrics"]
-    packages += ["flip-evaluator", "safetensors", "plyfile", "imageio", "av", "matplotlib", "mitsuba", "lpips"]
+    packages += ["flip-evaluator", "safetensors", "plyfile", "av", "matplotlib", "mitsuba", "lpips"]
     optional = {"mitsuba": "optional, for making scenes", "lpips": "optional, for the LPIPS metric"}
     rows += [(name, _version(name) or f"not installed ({optional.get(name, 'needed')})") for name in packages]
     width = max(len(name) for name, _ in rows)

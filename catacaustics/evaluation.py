@@ -147,14 +147,15 @@ def _protocol(run: Run, rows: list[dict[str, Any]]) -> dict[str, Any]:
     """Everything that the numbers depend on."""
     sizes = sorted({(row["width"], row["height"]) for row in rows})
     sources = {source: sum(row["mask"] == source for row in rows) for source in {row["mask"] for row in rows}}
-    device = run.scene.device
+    device, missing = run.scene.device, lpips_missing()
     return {
         "split": {"train": len(run.capture.train), "held_out": len(rows)},
         "resolution": [f"{width} x {height}" for width, height in sizes],
         "resize_filter": RESIZE_FILTER,
         "masks": {key: sources[key] for key in sorted(sources)},
         "views_inside": sum(row["inside"] is not None for row in rows),
-        "metrics": PROTOCOL | {"lpips": lpips_missing() or "VGG-16, whole image (torchmetrics)"},
+        "metrics": PROTOCOL
+        | {"lpips": f"not measured: {missing}" if missing else "VGG-16, whole image (torchmetrics)"},
         "seconds_per_frame": float(np.median([row["seconds"] for row in rows])),
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else _cpu_name(),
         "versions": {"catacaustics": catacaustics.__version__}

@@ -1,6 +1,7 @@
 """Image and mask files, resizing by a named filter, video. RGB, (height, width, 3), sRGB as stored."""
 
 from collections.abc import Iterable
+from fractions import Fraction
 from pathlib import Path
 
 import numpy as np
@@ -101,22 +102,40 @@ def list_images(folder: Path) -> list[Path]:
     )
 
 
-def write_video(path: Path, frames: Iterable[np.ndarray], fps: float = 24, quality: int = 20) -> int:
-    """Write H.264 MP4 that common players open. Returns the number of frames.
+def write_video(path: Path, frames: Iterable[np.ndarray], fps: float = 24.0, quality: int = 20) -> int:
+    """Write an H.264 MP4 that common players and browsers open (yuv420p, BT.709). Returns the number of frames.
 
     Args:
         frames: RGB images, float in [0, 1] or 8-bit, all of one size; odd sizes lose their last row or column.
         quality: constant rate factor of x264: lower is better, 18 is visually lossless.
-    """
-    import imageio.v3 as iio
 
-    count = 0
-    with atomic_path(path) as temporary, iio.imopen(temporary, "w", plugin="pyav") as file:
-        file.init_video_stream("libx264", fps=fps, pixel_format="yuv420p")
-        # 4.2.0 is what browsers and phones decode; crf is reachable only through the stream's options.
-        file._video_stream.options = {"crf": str(quality), "preset": "medium"}
-        for frame in frames:
-            data = to_bytes(frame)
-            file.write_frame(np.ascontiguousarray(data[: data.shape[0] & ~1, : data.shape[1] & ~1]))
+    Raises:
+        ValueError: no frames, or frames of several sizes.
+    """
+    import av
+    from av.video.reformatter import Colorspace
+
+    # Without the tags players guess the colour matrix from the frame's size.
+    tags = "colorprim=bt709:transfer=bt709:colormatrix=bt709"
+    options = {"crf": str(quality), "preset": "medium", "x264-params": tags}
+    count, stream, size = 0, None, None
+    with (
+        atomic_path(path) as temporary,
+        av.open(str(temporary), "w", format="mp4", options={"movflags": "faststart"}) as container,
+    ):
+        for image in frames:
+            data = np.ascontiguousarray(to_bytes(image)[: image.shape[0] & ~1, : image.shape[1] & ~1])
+            if stream is None:
+                size = data.shape
+                stream = container.add_stream("libx264", Fraction(fps).limit_denominator(65535), options)
+                stream.height, stream.width, stream.pix_fmt = size[0], size[1], "yuv420p"
+            elif data.shape != size:
+                raise ValueError(f"write_video needs frames of one size, got {size} and {data.shape}")
+            frame = av.VideoFrame.from_ndarray(data, "rgb24")
+            frame = frame.reformat(format="yuv420p", dst_colorspace=Colorspace.ITU709)
+            container.mux(stream.encode(frame))
             count += 1
+        if stream is None:
+            raise ValueError("write_video needs one or more frames")
+        container.mux(stream.encode())
     return count

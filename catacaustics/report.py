@@ -99,7 +99,8 @@ def report_html(
         views: the views with pictures.
         log: rows of metrics.jsonl; `skipped` lines of it were unreadable.
     """
-    name = escape(folder.absolute().name)
+    place = folder.absolute()
+    name = escape(f"{place.parent.name} / {place.name}")
     protocol = result["protocol"]
     facts = [
         f"{protocol['split']['held_out']} held-out views, {protocol['split']['train']} for training",
@@ -112,7 +113,7 @@ def report_html(
         if len(views) < len(result["views"])
         else "Held-out views"
     )
-    header = f'<h1>{name}</h1><p class="facts">{" · ".join(facts)}</p>{_summary(result["mean"])}'
+    header = f'<p class="facts">Held-out evaluation</p><h1>{name}</h1><p class="facts">{" · ".join(facts)}</p>'
     hint = (
         "Click a picture to enlarge it; there, arrow keys change the picture and the slider compares it with the "
         "photograph."
@@ -123,7 +124,7 @@ def report_html(
         _details("Training configuration", _definitions(config)),
     ]
     sections = [
-        f"<header>{header}{_links(folder, capture)}</header>",
+        f"<header>{header}{_summary(result['mean'])}{_links(folder, capture)}</header>",
         f'<section><h2>{shown}</h2><p class="hint">{hint}</p>{"".join(map(_view, views))}</section>',
         f"<section><h2>Training</h2>{_curves(log, skipped)}</section>",
         f"<section><h2>Details</h2>{''.join(details)}</section>",
@@ -256,7 +257,7 @@ def _curve(
                 logarithmic = logarithmic and bool((values > 0).all())
         changes = [b["seconds"] / seconds for a, b in pairwise(log) if a.get("stage") != b.get("stage")]
         for time in changes:
-            axes.axvline(time, color=ink, alpha=0.45, linewidth=0.9, linestyle=":")
+            axes.axvline(time, color=ink, alpha=0.7, linewidth=1.1, linestyle=":")
         if logarithmic:
             axes.set_yscale("log")
         elif label == "points":

@@ -62,7 +62,7 @@ def test_a_file_imports_only_from_floors_below_or_its_own_folder(path):
 
 
 def test_importing_the_package_needs_only_torch_and_numpy():
-    heavy = "scipy cv2 pycolmap open3d matplotlib imageio torchmetrics tyro plyfile safetensors mitsuba"
+    heavy = "scipy cv2 pycolmap open3d matplotlib av torchmetrics tyro plyfile safetensors mitsuba"
     code = (
         "import sys; import catacaustics, catacaustics.scene, catacaustics.splatting;"
         f"print([m for m in {heavy.split()!r} if m in sys.modules])"
