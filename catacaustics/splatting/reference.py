@@ -232,7 +232,7 @@ def _split(region: Viewport, means: Tensor, extent: Tensor, budget: int) -> list
 
 
 class _Blend(torch.autograd.Function):
-    """Blend splats that are sorted near to far. Pairs are listed again in the backward pass unless they are few."""
+    """Blend splats that are sorted near to far. Pairs beyond the budget are listed again in the backward pass."""
 
     @staticmethod
     def forward(ctx, means, forms, opacities, features, reach2, extent, viewport, budget):
@@ -240,7 +240,7 @@ class _Blend(torch.autograd.Function):
         image = features.new_zeros(height, width, channels)
         transmittance = features.new_ones(height, width)
         regions = _split(viewport, means, extent, budget) if len(means) and width and height else []
-        kept = []
+        kept, room = [], budget
         for region, index in regions:
             pairs = _list_pairs(means[index], forms[index], opacities[index], reach2[index], region)
             before, out = _transmittances(pairs, region.width * region.height)
@@ -251,7 +251,8 @@ class _Blend(torch.autograd.Function):
             rows, columns = _window(region, viewport)
             image[rows, columns] = colors.view(region.height, region.width, channels)
             transmittance[rows, columns] = out.view(region.height, region.width)
-            kept.append((pairs, before) if len(regions) == 1 else None)
+            room -= len(before)
+            kept.append((pairs, before) if room >= 0 else None)
         ctx.save_for_backward(means, forms, opacities, features, reach2)
         ctx.viewport, ctx.regions, ctx.kept = viewport, regions, kept
         return image, transmittance
