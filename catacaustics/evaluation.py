@@ -99,7 +99,7 @@ def reflector_mask(
 
 def _measure(run: Run, view: View, shown: bool) -> tuple[dict[str, Any], ReportView | None]:
     """The row of a view in metrics.json and, where it is shown, its pictures."""
-    camera = scaled_camera(view.camera, run.config["image_size"], 1)
+    camera = scaled_camera(view.camera, run.config["image_size"], 1.0)
     output, seconds = _timed_render(run.scene, camera)
     render = output.rgb.numpy()
     if not np.isfinite(render).all():

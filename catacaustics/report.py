@@ -1,6 +1,7 @@
 """report.html: an evaluation as one self-contained page that works offline."""
 
 import base64
+import math
 import os
 import re
 from collections.abc import Sequence
@@ -251,7 +252,8 @@ def _curve(
         figure = Figure(figsize=(5, 3.4), layout="constrained")
         axes = figure.add_subplot()
         for (key, name), color in zip(series.items(), ("#2f7fc4", "#d9822b"), strict=False):
-            time, values = _thin([(row["seconds"] / seconds, row[key]) for row in log if _is_number(row.get(key))])
+            points = [(row["seconds"] / seconds, float(row[key])) for row in log if _is_number(row.get(key))]
+            time, values = _thin(points)
             if len(time):
                 axes.plot(time, values, color=color, linewidth=1.8, label=name)
                 logarithmic = logarithmic and bool((values > 0).all())
@@ -263,7 +265,7 @@ def _curve(
         elif label == "points":
             axes.set_ylim(bottom=0)
             axes.yaxis.set_major_formatter(mpl.ticker.EngFormatter(sep=""))
-        if len(series) > 1:
+        if len(axes.get_legend_handles_labels()[0]) > 1:
             axes.legend(frameon=False, labelcolor=ink)
         axes.set_xlabel(f"training time ({unit})", color=ink)
         axes.set_ylabel(label, color=ink)
@@ -285,7 +287,7 @@ def _curve(
 
 
 def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float) and np.isfinite(value)
+    return isinstance(value, int | float) and math.isfinite(value)
 
 
 def _thin(points: list[tuple[float, float]], most: int = 300) -> tuple[np.ndarray, np.ndarray]:

@@ -1,6 +1,7 @@
 """The folder of a training run: config.json, scene.safetensors, metrics.jsonl and checkpoints."""
 
 import json
+import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -58,6 +59,8 @@ def open_run(folder: Path, capture: Path | None = None, device: str = "auto") ->
             "give its folder with --capture",
         )
     automatic = "cuda" if torch.cuda.is_available() else "cpu"
+    if device == "cuda" and automatic == "cpu":
+        raise UserError("There is no GPU that PyTorch can use.", "a CUDA device", "leave --device at auto, or take cpu")
     scene = Scene.load(path, automatic if device == "auto" else device)
     return Run(folder, scene, open_capture(root), config)
 
@@ -74,7 +77,7 @@ def read_log(folder: Path) -> tuple[list[dict[str, Any]], int]:
             row = json.loads(line)
         except json.JSONDecodeError:
             row = None
-        if isinstance(row, dict) and isinstance(row.get("seconds"), int | float):
+        if isinstance(row, dict) and isinstance(row.get("seconds"), int | float) and math.isfinite(row["seconds"]):
             rows.append(row)
         elif line.strip():
             skipped += 1
