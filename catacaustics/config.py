@@ -40,6 +40,9 @@ class SplatConfig:
     """Contributions with less alpha are dropped; 0 is exact, 1/255 is common practice."""
     near: float = 0.01
     """Points nearer to the camera plane than this (world units) are dropped."""
+    guard_band: float = 0.5
+    """Points whose centre lies farther outside the image than this share of its size are dropped: beside the camera the
+    affine projection is meaningless, and one such point would cover the image."""
     pair_budget: int = 4_000_000
     """Splat-pixel pairs held at a time: bounds memory at about 60 bytes a pair; results do not depend on it."""
 

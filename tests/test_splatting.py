@@ -55,7 +55,9 @@ def brute_force(positions, normals, footprints, opacities, features, camera, vie
     pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1).to(p.dtype)
     d = pixels[:, :, None] - means
     q = torch.einsum("hwni,nij,hwnj->hwn", d, inverse, d)
-    alpha = torch.where((q <= config.support**2) & (z > config.near), opacities * torch.exp(-q / 2), 0)
+    size = torch.tensor([camera.width, camera.height])
+    kept = ((means > -config.guard_band * size) & (means < (1 + config.guard_band) * size)).all(1) & (z > config.near)
+    alpha = torch.where((q <= config.support**2) & kept, opacities * torch.exp(-q / 2), 0)
     order = torch.argsort(z, stable=True)
     image, through = 0, torch.ones(pixels.shape[:2], dtype=p.dtype)
     for i in order.tolist():
@@ -165,6 +167,14 @@ def test_a_viewport_is_a_crop_and_may_reach_outside_the_image():
     whole = splat_points(*scene, camera, Viewport(-4, -4, 40, 30))
     part = splat_points(*scene, camera, Viewport(2, 3, 5, 7))
     torch.testing.assert_close(part.image, whole.image[7:14, 6:11], rtol=1e-12, atol=1e-14)
+
+
+def test_a_point_beside_the_camera_does_not_cover_the_image():
+    """Nearly in the camera plane, 60 degrees outside the view: its affine footprint would be thousands of pixels."""
+    one = torch.ones(1)
+    beside = torch.tensor([[0.5, 0.0, 0.02]])
+    out = splat_points(beside, torch.tensor([[0.0, 1.0, 0.0]]), 1e-2 * one, one, one[:, None], front_camera())
+    assert out.image.abs().max() == 0
 
 
 def test_the_camera_pose_moves_the_image_as_moving_the_points_does():

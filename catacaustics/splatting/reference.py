@@ -341,7 +341,7 @@ def splat_points(
 ) -> SplatOutput:
     """Splat oriented disks into a viewport; differentiable in every tensor.
 
-    Points at equal depth keep their input order. The colour is not normalised and has no background: blend one with
+    Points at equal depth keep their input order. Points behind the near plane or outside the guard band are dropped. The colour is not normalised and has no background: blend one with
     `transmittance`.
 
     Args:
@@ -360,14 +360,13 @@ def splat_points(
     pose = torch.tensor(camera.camera_from_world, dtype=positions.dtype, device=positions.device)
     lens = ((camera.fx, camera.fy), (camera.cx, camera.cy))
     with torch.no_grad():
-        z = positions @ pose[2, :3] + pose[2, 3]
-        candidates = torch.nonzero(z > config.near)[:, 0]
+        candidates = torch.nonzero(_in_guard_band(positions, pose, camera, config))[:, 0]
         chosen = (t.index_select(0, candidates) for t in (positions, normals, footprints))
         rough = project(*chosen, pose, *lens, config.low_pass)
         reach2 = _reach2(opacities[candidates], config)
         reach = rough.half_extent * reach2.sqrt()[:, None]
-        low = torch.tensor([viewport.x0, viewport.y0], dtype=z.dtype, device=z.device)
-        high = low + torch.tensor([viewport.width, viewport.height], dtype=z.dtype, device=z.device)
+        low = torch.tensor([viewport.x0, viewport.y0]).to(positions)
+        high = low + torch.tensor([viewport.width, viewport.height]).to(positions)
         touches = ((rough.means + reach > low) & (rough.means - reach < high)).all(1) & (reach2 > 0)
         visible = torch.nonzero(touches)[:, 0]
         visible = visible[torch.argsort(rough.depths[visible], stable=True)]
@@ -385,6 +384,18 @@ def splat_points(
         config.pair_budget,
     )
     return SplatOutput(image, transmittance, visible, splats.means)
+
+
+def _in_guard_band(positions: Tensor, pose: Tensor, camera: Camera, config: SplatConfig) -> Tensor:
+    """Points in front of the near plane whose centre is not too far outside the image (SplatConfig.guard_band)."""
+    x, y, z = (positions @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
+    kept = z > config.near
+    inv_z = torch.where(kept, 1 / z, 1)
+    axes = ((x, camera.fx, camera.cx, camera.width), (y, camera.fy, camera.cy, camera.height))
+    for coordinate, focal, center, size in axes:
+        mean = focal * coordinate * inv_z + center
+        kept = kept & (mean > -config.guard_band * size) & (mean < (1 + config.guard_band) * size)
+    return kept
 
 
 def _reach2(opacities: Tensor, config: SplatConfig) -> Tensor:
@@ -439,9 +450,8 @@ def points_in_view(
     with torch.no_grad():
         pose = torch.tensor(camera.camera_from_world, dtype=positions.dtype, device=positions.device)
         x, y, z = (positions @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
-        ahead = z > config.near
-        inv_z = torch.where(ahead, 1 / z, 1)
-        inside = ahead
+        inside = _in_guard_band(positions, pose, camera, config)
+        inv_z = torch.where(inside, 1 / z, 1)
         axes = (
             (x * inv_z, camera.fx, camera.cx, viewport.x0, viewport.width),
             (y * inv_z, camera.fy, camera.cy, viewport.y0, viewport.height),

@@ -157,7 +157,7 @@ def initial_scene(
     reflective = [] if config.warp == "none" else volumes
     clouds = [start_cloud(s, n, primary=False) for s, n in zip(seeds[1:], counts[1:], strict=True)]
     warps = [make_warp(config, capture, v) for v in reflective]
-    near = 1e-3 * scene_extent(capture)
+    near = 1e-2 * scene_extent(capture)
     return Scene(primary, clouds, warps, reflective, environment, renderer, SplatConfig(near=near, alpha_min=1 / 255))
 
 
