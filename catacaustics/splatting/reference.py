@@ -341,8 +341,8 @@ def splat_points(
 ) -> SplatOutput:
     """Splat oriented disks into a viewport; differentiable in every tensor.
 
-    Points at equal depth keep their input order. Points behind the near plane or outside the guard band are dropped. The colour is not normalised and has no background: blend one with
-    `transmittance`.
+    Points at equal depth keep their input order. Points behind the near plane or outside the guard band are dropped.
+    The colour is not normalised and has no background: blend one with `transmittance`.
 
     Args:
         positions, normals: world space; normals of unit length.
