@@ -305,7 +305,7 @@ def _normals(field: torch.Tensor, slope: torch.Tensor, camera: Camera) -> torch.
         ],
         -1,
     )
-    return -F.normalize(away, dim=-1)
+    return -away * away.square().sum(-1, keepdim=True).clamp_min(1e-24).rsqrt()
 
 
 def estimate_depth(

@@ -37,7 +37,7 @@ from catacaustics.images import resize, write_image
 from catacaustics.points import PointCloud
 from catacaustics.shapes import Float
 
-_VERSION = 1
+_VERSION = 2
 """Raise when the maps change for the same settings: old ones are then made again."""
 
 NEIGHBORS = 6
@@ -46,13 +46,13 @@ NEIGHBORS = 6
 COARSE_SIZE = 160
 """Longer side in pixels at which depth ranges are searched where there are no sparse points."""
 
-MIN_VIEWS = 4
+MIN_VIEWS = 3
 """Views that must agree on a fused point, in captures that have as many."""
 
 MAX_DEPTH_ERROR = 0.01
 """Relative difference of depth within which views agree."""
 
-MAX_NORMAL_ERROR = 25.0
+MAX_NORMAL_ERROR = 40.0
 """Angle in degrees within which views agree."""
 
 MASK_MARGIN = 3
@@ -289,15 +289,25 @@ def _angles(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.degrees(np.arccos(np.clip((a * b).sum(-1), -1, 1)))
 
 
-def _pick(scores: np.ndarray, directions: np.ndarray, count: int) -> list[int]:
-    """The best views, one after another; views in about the same direction as one already picked count for less."""
-    scores = scores.copy()
+def _pick(worth: np.ndarray, directions: np.ndarray, count: int) -> list[int]:
+    """The best views, one after another, so that every point is seen by some.
+
+    Args:
+        worth: (views, points), how well a view serves a point. A point that is served already counts for less.
+        directions: (views, 3), unit vectors from the scene. A view in about the direction of one already picked, too.
+    """
+    need = np.ones(worth.shape[1])
+    spread = np.ones(len(worth))
     picked: list[int] = []
-    while len(picked) < count and scores.max() > 1e-3:
+    while len(picked) < count:
+        scores = (worth * need).mean(1) * spread
         best = int(scores.argmax())
+        if scores[best] <= 1e-4:
+            break
         picked.append(best)
-        scores[best] = 0
-        scores *= np.minimum(1, _angles(directions, directions[best]) / 5)
+        need *= 1 - 0.6 * worth[best]
+        spread *= np.minimum(1, _angles(directions, directions[best]) / 5)
+        spread[best] = 0
     return picked
 
 
@@ -320,9 +330,8 @@ def choose_neighbors(
         distance = np.linalg.norm(visible[None] - centers[:, None], axis=-1)
         ratio = np.minimum(distance, distance[index]) / np.maximum(np.maximum(distance, distance[index]), 1e-12)
         worth = _angle_weight(_angles(sight, sight[index])) * ratio * seen[:, seen[index]]
-        scores = worth.mean(1)
-        scores[index] = 0
-        chosen.append(_pick(scores, normalize(np.median(visible, 0) - centers), count))
+        worth[index] = 0
+        chosen.append(_pick(worth, normalize(np.median(visible, 0) - centers), count))
     return chosen
 
 
@@ -361,13 +370,12 @@ def _guess(cameras: list[Camera], index: int) -> tuple[list[int], tuple[float, f
     points = camera.unproject(np.tile(grid, (len(depths), 1)), np.repeat(depths, len(grid)))
     sight = normalize(points[None] - centers[:, None])
     seen = np.stack([_inside(other, points)[0] for other in cameras])
-    worth = (_angle_weight(_angles(sight, sight[index])) * seen).reshape(len(cameras), len(depths), -1).mean(-1)
+    worth = (_angle_weight(_angles(sight, sight[index])) * seen).reshape(len(cameras), len(depths), -1)
     worth[index] = 0
-    support = np.sort(worth, 0)[-NEIGHBORS:].sum(0)
+    support = np.sort(worth.mean(-1), 0)[-NEIGHBORS:].sum(0)
     likely = support / max(support.max(), 1e-12)
-    neighbors = _pick(
-        (worth * likely).mean(1) / likely.mean(), normalize(_center(camera, depths, likely) - centers), NEIGHBORS
-    )
+    middle = _center(camera, depths, likely)
+    neighbors = _pick((worth * likely[:, None]).reshape(len(cameras), -1), normalize(middle - centers), NEIGHBORS)
     if not neighbors:
         neighbors = np.argsort(gaps[index])[: min(NEIGHBORS, len(cameras) - 1)].tolist()
     near = depths[np.argmax(likely > 0.15)]
