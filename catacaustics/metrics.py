@@ -155,7 +155,7 @@ def lpips_missing() -> str:
     import torch
 
     try:
-        from torchvision.models import VGG16_Weights
+        from torchvision.models import VGG16_Weights  # pyright: ignore[reportMissingImports]
     except ImportError:
         return "torchvision is not installed"
     weights = Path(torch.hub.get_dir()) / "checkpoints" / Path(VGG16_Weights.DEFAULT.url).name

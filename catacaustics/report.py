@@ -245,10 +245,10 @@ def _curve(
 
     import matplotlib as mpl
     from matplotlib.figure import Figure
+    from matplotlib.ticker import EngFormatter
 
     ink = "#012345"  # replaced by the page's text colour below
-    style = {"svg.fonttype": "none", "svg.hashsalt": title, "font.family": "sans-serif", "font.size": 11}
-    with mpl.rc_context(style):
+    with mpl.rc_context({"svg.fonttype": "none", "svg.hashsalt": title, "font.family": "sans-serif", "font.size": 11}):
         figure = Figure(figsize=(5, 3.4), layout="constrained")
         axes = figure.add_subplot()
         for (key, name), color in zip(series.items(), ("#2f7fc4", "#d9822b"), strict=False):
@@ -264,7 +264,7 @@ def _curve(
             axes.set_yscale("log")
         elif label == "points":
             axes.set_ylim(bottom=0)
-            axes.yaxis.set_major_formatter(mpl.ticker.EngFormatter(sep=""))
+            axes.yaxis.set_major_formatter(EngFormatter(sep=""))
         if len(axes.get_legend_handles_labels()[0]) > 1:
             axes.legend(frameon=False, labelcolor=ink)
         axes.set_xlabel(f"training time ({unit})", color=ink)
