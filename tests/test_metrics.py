@@ -2,9 +2,9 @@
 
 import numpy as np
 import pytest
+import torch
 from scipy.ndimage import gaussian_filter
 
-import torch
 from catacaustics.metrics import PSNR_CAP, Metrics, compare, flip_map, lpips_missing, mean_metrics, ssim_map
 
 
