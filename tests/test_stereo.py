@@ -310,25 +310,32 @@ def test_masked_pixels_yield_no_points(fused):
     assert ((radius < 0.51) & (masked.positions[:, 2] > 0.1)).sum() == 0
 
 
-def test_fusion_of_exact_maps_returns_the_surface(tmp_path):
+def fuse_exact_maps(folder: Path, normal, scales=(1, 1, 1, 1, 1)) -> PointCloud:
+    """Fuse true maps of a plane through the origin, the depths of each view multiplied by its scale."""
     cameras = cross()
-    surface = plane((0.3, -1, 0.2), 0.0)
     points = []
-    for index, camera in enumerate(cameras):
-        image, depth, normals = render(camera, [surface])
-        write_image(tmp_path / "images" / f"{index}.png", image)
-        depth_path, normal_path = fusion.map_paths(tmp_path, f"{index}.png")
-        fusion.write_map(depth_path, depth)
+    for index, (camera, scale) in enumerate(zip(cameras, scales, strict=True)):
+        image, depth, normals = render(camera, [plane(normal, 0.0)])
+        write_image(folder / "images" / f"{index}.png", image)
+        depth_path, normal_path = fusion.map_paths(folder, f"{index}.png")
+        fusion.write_map(depth_path, scale * depth)
         fusion.write_map(normal_path, normals @ camera.camera_from_world[:3, :3].T)
         points.append(camera.unproject(pixel_centers(camera.viewport)[::20, ::20], depth[::20, ::20]).reshape(-1, 3))
-    views = [(f"{index}.png", camera) for index, camera in enumerate(cameras)]
-    fusion.write_overlap_model(tmp_path, views, np.concatenate(points))
-    cloud = fusion.fuse_maps(tmp_path, "photometric", 5, 0.01, 20.0)
+    fusion.write_overlap_model(folder, [(f"{i}.png", c) for i, c in enumerate(cameras)], np.concatenate(points))
+    return fusion.fuse_maps(folder, "photometric", 3, 0.01, 20.0)
+
+
+def test_fusion_of_exact_maps_returns_the_surface(tmp_path):
     normal = normalize(np.array([0.3, -1, 0.2]))
+    cloud = fuse_exact_maps(tmp_path, normal)
     assert len(cloud) > WIDTH * HEIGHT // 4
     assert np.abs(cloud.positions @ normal).mean() < 2e-3
     assert np.abs(cloud.positions @ normal).max() < 1e-2
     assert angles(cloud.normals, normal).max() < 0.5
+
+
+def test_fusion_of_maps_that_contradict_each_other_returns_nothing(tmp_path):
+    assert len(fuse_exact_maps(tmp_path, [0.3, -1, 0.2], scales=(1, 1.1, 1.2, 1.3, 1.4))) == 0
 
 
 def test_lone_points_are_removed():
@@ -361,3 +368,10 @@ def test_sparse_points_take_the_place_of_the_search_for_depth(tmp_path):
     cloud = stereo.fuse_capture(capture, sparse_points=points)
     assert not any((capture.root / "work" / "stereo").rglob("coarse"))
     assert (surface_distance(cloud.positions) < 0.03).mean() > 0.95
+
+
+def test_photographs_from_one_place_are_refused(tmp_path):
+    capture = ring_capture(tmp_path, count=5)
+    train = [View(view.name, capture.train[0].camera) for view in capture.train]
+    with pytest.raises(UserError, match="from the same place"):
+        stereo.fuse_capture(dataclasses.replace(capture, train=train))

@@ -342,7 +342,8 @@ def estimate_depth(
                 field = F.interpolate(field[None, None], size=view.pixels.shape, mode="bilinear")[0, 0]
             field, slope, score = _refine(matcher, field, step, bounds, config)
     else:
-        field, slope = _fit_planes(_median(field), torch.ones_like(field), torch.zeros(2, *field.shape), step, 1)
+        flat = torch.zeros(2, *field.shape, device=field.device)
+        field, slope = _fit_planes(_median(field), torch.ones_like(field), flat, step, 1)
         score = matcher.score(field[None])[0]
     keep = (score > config.min_score) & (matcher.variance[0] > config.min_contrast**2)
     depth = torch.where(keep, 1 / field, 0)

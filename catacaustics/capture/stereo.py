@@ -225,6 +225,9 @@ class _Stereo:
         """Depth and normal maps of all views by COLMAP's PatchMatch; COLMAP keeps finished ones."""
         pycolmap = import_pycolmap()
         self._prepare(points)
+        for view in self.views:
+            for path in map_paths(self.folder, view.name):
+                path.parent.mkdir(parents=True, exist_ok=True)
         options = pycolmap.PatchMatchOptions()
         options.geom_consistency = True
         pycolmap.patch_match_stereo(self.folder, options=options)
@@ -355,16 +358,15 @@ def _guess(cameras: list[Camera], index: int) -> tuple[list[int], tuple[float, f
     """
     camera = cameras[index]
     centers = np.stack([c.center for c in cameras])
-    gaps = np.linalg.norm(centers[:, None] - centers[None], axis=-1)
-    np.fill_diagonal(gaps, np.inf)
-    apart = gaps[np.isfinite(gaps) & (gaps > 1e-9 * np.nanmax(np.where(np.isfinite(gaps), gaps, np.nan)))]
-    if not len(apart):
+    gaps = np.linalg.norm(centers[:, None] - centers, axis=-1)
+    gaps[gaps <= 1e-9 * gaps.max()] = np.inf
+    if np.isinf(gaps).all():
         raise UserError(
             "All training views were taken from the same place.",
             "photographs from different places: depth comes from parallax",
             "walk around the scene while taking photographs",
         )
-    spacing = np.median(np.where(gaps > apart.min() / 2, gaps, np.inf).min(1))
+    spacing = np.median(gaps.min(1))
     depths = spacing * np.geomspace(0.3, 100, 48)
     grid = pixel_centers(camera.viewport)[:: max(1, camera.height // 5), :: max(1, camera.width // 5)].reshape(-1, 2)
     points = camera.unproject(np.tile(grid, (len(depths), 1)), np.repeat(depths, len(grid)))
@@ -374,16 +376,10 @@ def _guess(cameras: list[Camera], index: int) -> tuple[list[int], tuple[float, f
     worth[index] = 0
     support = np.sort(worth.mean(-1), 0)[-NEIGHBORS:].sum(0)
     likely = support / max(support.max(), 1e-12)
-    middle = _center(camera, depths, likely)
+    middle = camera.unproject(grid.mean(0), np.exp(np.average(np.log(depths), weights=likely + 1e-9)))
     neighbors = _pick((worth * likely[:, None]).reshape(len(cameras), -1), normalize(middle - centers), NEIGHBORS)
     if not neighbors:
         neighbors = np.argsort(gaps[index])[: min(NEIGHBORS, len(cameras) - 1)].tolist()
     near = depths[np.argmax(likely > 0.15)]
     # In inverse depth the far end costs little: it goes out to where the likely depths cannot be told from infinity.
     return neighbors, (float(0.01 / near), float(1 / near))
-
-
-def _center(camera: Camera, depths: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """The point on the optical axis at the mean likely depth."""
-    depth = np.exp((np.log(depths) * weight).sum() / weight.sum()) if weight.sum() else depths[0]
-    return camera.unproject(np.array([camera.width / 2, camera.height / 2]), np.array(depth))
