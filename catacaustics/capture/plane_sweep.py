@@ -31,7 +31,7 @@ class SweepConfig:
     """The planes are swept at the largest halving of the image whose longer side is at most this."""
     window_radius: int = 3
     """Correlation windows have 2 r + 1 pixels a side."""
-    best: int = 3
+    best: int = 2
     """The score of a depth is the mean over this many best neighbours."""
     plane_step: float = 0.7
     """Spacing of the swept planes as seen in the neighbours."""
@@ -42,11 +42,11 @@ class SweepConfig:
     """Cost of a larger step; less across an edge of the image."""
     iterations: int = 2
     """Rounds of refinement at each resolution."""
-    min_score: float = 0.6
+    min_score: float = 0.55
     """Pixels whose mean correlation is lower are dropped."""
-    noise: float = 1.2 / 255
+    noise: float = 0.75 / 255
     """Standard deviation of the image noise: it holds correlations down where the texture is no stronger than it."""
-    min_contrast: float = 1.5 / 255
+    min_contrast: float = 1.0 / 255
     """Windows of lower standard deviation are dropped as textureless."""
 
 
@@ -75,17 +75,16 @@ def _box_mean(x: torch.Tensor, radius: int) -> torch.Tensor:
     window = 2 * radius + 1
     for dim in (-2, -1):
         length = x.shape[dim] - window + 1
-        block, size, offset, total = x, 1, 0, None
+        block, size, offset, pieces = x, 1, 0, []
         while size <= window:
             if window & size:
-                piece = block.narrow(dim, offset, length)
-                total = piece if total is None else total + piece
+                pieces.append(block.narrow(dim, offset, length))
                 offset += size
             if 2 * size <= window:
                 reach = block.shape[dim] - size
                 block = block.narrow(dim, 0, reach) + block.narrow(dim, size, reach)
             size *= 2
-        x = total
+        x = sum(pieces[1:], pieces[0])
     return x / window**2
 
 
@@ -269,7 +268,8 @@ def _refine(
     slope = torch.zeros(2, *field.shape, device=field.device)
     score = matcher.score(field[None])[0]
     for iteration in range(config.iterations):
-        field = _median(field) if iteration == 0 else field
+        if iteration == 0:
+            field = _median(field)
         weight = score.clamp_min(0.05) ** 2
         smooth, slope = _fit_planes(field, weight, slope, 2 * step, 1)
         smooth, slope = _fit_planes(smooth, weight, slope, step, 2)
@@ -280,17 +280,14 @@ def _refine(
         chosen = candidates.gather(0, index[None])[0]
         small = step * 0.5 / (1 + iteration)
         below, above = matcher.score_all(torch.stack([chosen - small, chosen + small]))
-        field = (
-            chosen
-            + small
-            * torch.where(
-                (best >= below) & (best >= above), _peak(below, best, above), torch.where(above > below, 1.0, -1.0)
-            )
-        ).clamp_(*bounds)
+        at_peak = (best >= below) & (best >= above)
+        uphill = torch.where(above > below, 1.0, -1.0)
+        offset = torch.where(at_peak, _peak(below, best, above), uphill)
+        field = (chosen + small * offset).clamp_(*bounds)
         score = torch.maximum(best, torch.maximum(below, above))
     weight = score.clamp_min(0.05) ** 2
-    for _ in range(2):
-        smooth, slope = _fit_planes(field, weight, slope, 0.5 * step, 2)
+    _, slope = _fit_planes(field, weight, slope, 0.5 * step, 2)
+    smooth, slope = _fit_planes(field, weight, slope, 0.5 * step, 2)
     return smooth, slope, matcher.score(smooth[None])[0]
 
 
@@ -335,11 +332,10 @@ def estimate_depth(
     step = float(planes[1] - planes[0]) / config.plane_step
     bounds = (inverse_range[0] * 0.8, inverse_range[1] * 1.1)
     if refine:
-        for level in reversed(pyramid):
-            if level[0] is not view:
-                view, others = level
-                matcher, step = _Matcher(view, others, config), step / 2
-                field = F.interpolate(field[None, None], size=view.pixels.shape, mode="bilinear")[0, 0]
+        field, slope, score = _refine(matcher, field, step, bounds, config)
+        for view, others in reversed(pyramid[:-1]):
+            matcher, step = _Matcher(view, others, config), step / 2
+            field = F.interpolate(field[None, None], size=view.pixels.shape, mode="bilinear")[0, 0]
             field, slope, score = _refine(matcher, field, step, bounds, config)
     else:
         flat = torch.zeros(2, *field.shape, device=field.device)

@@ -37,7 +37,7 @@ from catacaustics.images import resize, write_image
 from catacaustics.points import PointCloud
 from catacaustics.shapes import Float
 
-_VERSION = 2
+_VERSION = 1
 """Raise when the maps change for the same settings: old ones are then made again."""
 
 NEIGHBORS = 6
@@ -376,7 +376,8 @@ def _guess(cameras: list[Camera], index: int) -> tuple[list[int], tuple[float, f
     worth[index] = 0
     support = np.sort(worth.mean(-1), 0)[-NEIGHBORS:].sum(0)
     likely = support / max(support.max(), 1e-12)
-    middle = camera.unproject(grid.mean(0), np.exp(np.average(np.log(depths), weights=likely + 1e-9)))
+    middle_depth = np.exp(np.average(np.log(depths), weights=likely + 1e-9))
+    middle = camera.unproject(grid.mean(0), np.asarray(middle_depth))
     neighbors = _pick((worth * likely[:, None]).reshape(len(cameras), -1), normalize(middle - centers), NEIGHBORS)
     if not neighbors:
         neighbors = np.argsort(gaps[index])[: min(NEIGHBORS, len(cameras) - 1)].tolist()
