@@ -17,6 +17,7 @@ from catacaustics.errors import UserError
 from catacaustics.files import write_json, write_text
 from catacaustics.images import RESIZE_FILTER, resize
 from catacaustics.metrics import PROTOCOL, Metrics, compare, lpips_missing, mean_metrics
+from catacaustics.reflectors.volume import ReflectionVolume, build_volume
 from catacaustics.report import ReportView, report_html, report_view
 from catacaustics.run import Run, open_run, read_log
 from catacaustics.scene import RenderOutput, Scene
@@ -46,8 +47,9 @@ def evaluate_run(run: Run, shown_views: int = 12) -> dict[str, Any]:
         )
     shown = set(np.linspace(0, len(views) - 1, min(shown_views, len(views))).round().astype(int).tolist())
     rows, pictures = [], []
+    volumes = reflection_volumes(run.scene, run.capture)
     for i, view in enumerate(tqdm(views, desc="evaluation", unit="view")):
-        row, picture = _measure(run, view, i in shown)
+        row, picture = _measure(run, volumes, view, i in shown)
         rows.append(row)
         if picture is not None:
             pictures.append(picture)
@@ -72,8 +74,15 @@ def format_table(result: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+def reflection_volumes(scene: Scene, capture: Capture) -> list[ReflectionVolume]:
+    """The scene's volumes, and those of painted reflectors that it was trained without (primary cloud alone): every
+    run on a capture is measured on the same pixels."""
+    known = {volume.name for volume in scene.volumes}
+    return [*scene.volumes, *(build_volume(capture, name) for name in capture.reflectors if name not in known)]
+
+
 def reflector_mask(
-    scene: Scene, capture: Capture, view: View, camera: Camera
+    volumes: list[ReflectionVolume], capture: Capture, view: View, camera: Camera
 ) -> tuple[Bool[np.ndarray, "height width"] | None, str]:
     """Union of the reflectors in a view, and where it came from: "painted", "projected", "both" or "none".
 
@@ -83,21 +92,23 @@ def reflector_mask(
         camera: the view's camera at the wanted size.
     """
     masks, sources = [], set()
-    volumes = {volume.name: volume for volume in scene.volumes}
-    for name in sorted({*capture.reflectors, *volumes}):
+    by_name = {volume.name: volume for volume in volumes}
+    for name in sorted({*capture.reflectors, *by_name}):
         painted = capture.mask(view, name)
         if painted is not None:
             masks.append(resize(painted.astype(np.float32), camera.width, camera.height) > 0.5)
             sources.add("painted")
-        elif name in volumes:
-            masks.append(volumes[name].project_mask(camera))
+        elif name in by_name:
+            masks.append(by_name[name].project_mask(camera))
             sources.add("projected")
     if not masks:
         return None, "none"
     return np.logical_or.reduce(masks), "both" if len(sources) == 2 else sources.pop()
 
 
-def _measure(run: Run, view: View, shown: bool) -> tuple[dict[str, Any], ReportView | None]:
+def _measure(
+    run: Run, volumes: list[ReflectionVolume], view: View, shown: bool
+) -> tuple[dict[str, Any], ReportView | None]:
     """The row of a view in metrics.json and, where it is shown, its pictures."""
     camera = scaled_camera(view.camera, run.config["image_size"], 1.0)
     output, seconds = _timed_render(run.scene, camera)
@@ -109,7 +120,7 @@ def _measure(run: Run, view: View, shown: bool) -> tuple[dict[str, Any], ReportV
             "train again from an earlier checkpoint or with lower learning rates",
         )
     photo = resize(run.capture.image(view), camera.width, camera.height).astype(np.float32) / 255
-    mask, source = reflector_mask(run.scene, run.capture, view, camera)
+    mask, source = reflector_mask(volumes, run.capture, view, camera)
     comparison = compare(render, photo, mask)
     row = {
         "name": view.name,

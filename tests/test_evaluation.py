@@ -87,7 +87,7 @@ def test_the_protocol_names_everything_that_the_numbers_depend_on(capture, run, 
 def test_the_painted_mask_goes_before_the_projected_volume(capture, volume):
     view = capture.held_out[0]
     scene = StandInScene(capture, volumes=(volume,))
-    mask, source = reflector_mask(scene, capture, view, view.camera)
+    mask, source = reflector_mask(scene.volumes, capture, view, view.camera)
     assert source == "painted"
     np.testing.assert_array_equal(mask, ball_mask(view.camera))
 
@@ -95,7 +95,7 @@ def test_the_painted_mask_goes_before_the_projected_volume(capture, volume):
 def test_a_view_without_a_painted_mask_takes_the_projected_volume(capture, volume, monkeypatch):
     view = capture.held_out[0]
     monkeypatch.setattr(type(capture), "mask", lambda *_: None)
-    mask, source = reflector_mask(StandInScene(capture, volumes=(volume,)), capture, view, view.camera)
+    mask, source = reflector_mask([volume], capture, view, view.camera)
     assert source == "projected"
     assert mask[ball_mask(view.camera)].all()  # the volume errs on the large side
 
@@ -103,7 +103,7 @@ def test_a_view_without_a_painted_mask_takes_the_projected_volume(capture, volum
 def test_the_mask_is_the_union_of_all_reflectors(capture, volume):
     view = capture.held_out[0]
     other = replace(volume, name="other", halfspaces=volume.halfspaces, vertices=volume.vertices)
-    mask, source = reflector_mask(StandInScene(capture, volumes=(volume, other)), capture, view, view.camera)
+    mask, source = reflector_mask([volume, other], capture, view, view.camera)
     assert source == "both"
     np.testing.assert_array_equal(mask, ball_mask(view.camera) | other.project_mask(view.camera))
 

@@ -84,7 +84,8 @@ def train(config: TrainConfig) -> Scene:
     seeds = [primary_seeds(capture, volumes, config, rng)]
     if config.warp != "none":
         seeds += [reflection_seeds(capture, v, config, rng) for v in volumes]
-    write_json(run / "config.json", {k: str(v) if isinstance(v, Path) else v for k, v in asdict(config).items()})
+    settings = asdict(config) | {"capture": str(Path(config.capture).resolve()), "run": str(run.resolve())}
+    write_json(run / "config.json", settings)
     state = _start(capture, volumes, seeds, config, rng)
     try:
         _loop(state, capture, volumes, seeds, config)
