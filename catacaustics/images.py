@@ -74,7 +74,8 @@ def encode_image(image: np.ndarray, suffix: str, quality: int = 95) -> bytes:
     data = to_bytes(image)
     if data.ndim == 3:
         data = data[..., ::-1]
-    options = [cv2.IMWRITE_JPEG_QUALITY, quality] if suffix.lower() in (".jpg", ".jpeg") else []
+    jpeg = [cv2.IMWRITE_JPEG_QUALITY, quality, cv2.IMWRITE_JPEG_OPTIMIZE, 1]
+    options = jpeg if suffix.lower() in (".jpg", ".jpeg") else []
     return cv2.imencode(suffix, np.ascontiguousarray(data), options)[1].tobytes()
 
 

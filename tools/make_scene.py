@@ -2,8 +2,8 @@
 
     python tools/make_scene.py ball scenes/ball
 
-Run it again to go on where it was stopped: finished views are kept. Needs Mitsuba 3 (`pip install 'catacaustics[scenes]'`)
-and, on a CPU, the LLVM library.
+Run it again to go on where it was stopped: finished views are kept. Needs Mitsuba 3 (the extra `scenes` of this
+package) and, on a CPU, the LLVM library.
 """
 
 import io
@@ -15,6 +15,11 @@ from typing import Annotated, Literal
 
 import numpy as np
 import tyro
+from scene_maker.cameras import HandHeld, held_out_cameras
+from scene_maker.catalogue import build
+from scene_maker.model import SceneModel
+from scene_maker.render import Renderer, choose_variant
+from scene_maker.solids import ply_bytes
 from tqdm import tqdm
 
 from catacaustics.cameras import Camera
@@ -23,11 +28,6 @@ from catacaustics.capture.truth import write_truth
 from catacaustics.errors import UserError
 from catacaustics.files import read_json, write_bytes, write_json
 from catacaustics.images import write_image
-from scene_maker.cameras import HandHeld, held_out_cameras
-from scene_maker.catalogue import build
-from scene_maker.model import SceneModel
-from scene_maker.render import Renderer, choose_variant
-from scene_maker.solids import ply_bytes
 
 CLEARANCE = 0.15
 """Free space that every camera needs around it, in metres."""
@@ -48,7 +48,7 @@ class MakeScene:
         seed: seed of the scene, its cameras and the noise.
         variant: Mitsuba variant; auto takes the fastest that works.
         quality: JPEG quality.
-        truth_every: every n-th training view gets ground truth; held-out views always do.
+        truth_every: every n-th training and every m-th held-out view gets ground truth.
     """
 
     scene: Annotated[str, tyro.conf.Positional]
@@ -61,7 +61,7 @@ class MakeScene:
     seed: int = 0
     variant: Literal["auto", "cuda_ad_rgb", "llvm_ad_rgb", "scalar_rgb"] = "auto"
     quality: int = 92
-    truth_every: int = 1
+    truth_every: tuple[int, int] = (1, 1)
 
 
 def camera_problem(renderer: Renderer, camera: Camera) -> str | None:
@@ -135,6 +135,7 @@ def _start(config: MakeScene, variant: str) -> None:
     import mitsuba as mi
 
     settings = {k: v for k, v in asdict(config).items() if k not in ("out", "variant")}
+    settings["truth_every"] = list(config.truth_every)  # as JSON gives it back
     path = config.out / "scene.json"
     if path.is_file():
         before = read_json(path).get("settings", {})
@@ -188,7 +189,8 @@ def make_scene(config: MakeScene, detail: float = 1.0) -> None:
         truth, reflector = renderer.truth(view.camera)
         for k, r in enumerate(model.reflectors):
             write_image(config.out / "masks" / r.name / Path(view.name).with_suffix(".png"), reflector == k)
-        if i >= config.train or i % config.truth_every == 0:
+        every_train, every_held_out = config.truth_every
+        if (i % every_train if i < config.train else (i - config.train) % every_held_out) == 0:
             write_truth(config.out, view.name, truth)
         image = develop(renderer.photograph(view.camera, config.spp, config.seed * len(views) + i))
         write_image(config.out / "images" / view.name, image, config.quality)

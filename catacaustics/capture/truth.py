@@ -39,17 +39,19 @@ def truth_path(root: Path, view_name: str) -> Path:
     return Path(root) / "truth" / Path(view_name).with_suffix(".npz")
 
 
-def _differences(levels: np.ndarray) -> np.ndarray:
-    """Differences along rows, then along columns, modulo 2^16: near zero on smooth surfaces. Low bytes, high bytes."""
-    delta = levels.astype(np.uint16)
+def _encoded(levels: np.ndarray, dtype: type) -> np.ndarray:
+    """Differences along rows, then along columns, wrapping around: near zero on smooth surfaces. One plane a byte."""
+    delta = levels.astype(dtype)
     for axis in (1, 0):
         delta = np.diff(delta, axis=axis, prepend=np.zeros_like(np.take(delta, [0], axis)))
-    return np.stack([delta & 255, delta >> 8]).astype(np.uint8)
+    low_to_high = delta.astype(delta.dtype.newbyteorder("<"))[..., None].view(np.uint8)
+    return np.ascontiguousarray(np.moveaxis(low_to_high, -1, 0))
 
 
-def _levels(stored: np.ndarray) -> np.ndarray:
-    levels = stored[0].astype(np.uint16) | (stored[1].astype(np.uint16) << 8)
-    return np.cumsum(np.cumsum(levels, axis=0, dtype=np.uint16), axis=1, dtype=np.uint16)
+def _decoded(planes: np.ndarray) -> np.ndarray:
+    dtype = np.dtype({1: "<u1", 2: "<u2"}[len(planes)])
+    delta = np.ascontiguousarray(np.moveaxis(planes, 0, -1)).view(dtype)[..., 0]
+    return np.cumsum(np.cumsum(delta, axis=0, dtype=dtype), axis=1, dtype=dtype)
 
 
 def write_truth(root: Path, view_name: str, truth: Truth, source_step: float = 1e-3) -> None:
@@ -69,10 +71,10 @@ def write_truth(root: Path, view_name: str, truth: Truth, source_step: float = 1
     step = max(source_step, float((sources.max(0) - low).max()) / 65535)
     source = np.where(reached[..., None], np.rint((np.where(reached[..., None], truth.source, low) - low) / step), 0)
     arrays = {
-        "depth": _differences(depth),
+        "depth": _encoded(depth, np.uint16),
         "depth_scale": np.float64(depth_scale),
-        "normals": _differences(np.rint(np.nan_to_num(truth.normals) * 127) + 127),
-        "source": _differences(source),
+        "normals": _encoded(np.rint(np.nan_to_num(truth.normals) * 127) + 127, np.uint8),
+        "source": _encoded(source, np.uint16),
         "source_low": low,
         "source_step": np.float64(step),
         "reached": np.packbits(reached, axis=-1),
@@ -96,11 +98,11 @@ def read_truth(capture_root: Path, view_name: str) -> Truth:
     try:
         with np.load(path, allow_pickle=False) as file:
             stored = {name: file[name] for name in file.files}
-        depth, width = _levels(stored["depth"]).astype(float), stored["depth"].shape[2]
+        depth, width = _decoded(stored["depth"]).astype(float), stored["depth"].shape[2]
         reached = np.unpackbits(stored["reached"], axis=-1, count=width).astype(bool)
         mirror = np.unpackbits(stored["mirror_mask"], axis=-1, count=width).astype(bool)
-        source = _levels(stored["source"]) * stored["source_step"] + stored["source_low"]
-        normals = _levels(stored["normals"]).astype(float) - 127
+        source = _decoded(stored["source"]) * stored["source_step"] + stored["source_low"]
+        normals = _decoded(stored["normals"]).astype(float) - 127
         scale = float(stored["depth_scale"])
     except FileNotFoundError as error:
         raise UserError(

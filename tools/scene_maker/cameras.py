@@ -55,7 +55,8 @@ class HandHeld:
 
 
 def held_out_cameras(arcs: list[Arcs], count: int, width: int, height: int) -> list[Camera]:
-    """A smooth path between the heights of the arcs; with several targets it travels from the first to the last."""
+    """A smooth path between the heights of the arcs; with several targets it travels from the first to the last,
+    standing back between them."""
     path = []
     for t in np.linspace(0, 1, count):
         position = t * (len(arcs) - 1)
@@ -65,7 +66,8 @@ def held_out_cameras(arcs: list[Arcs], count: int, width: int, height: int) -> l
         eyes = []
         for arc in ends:
             a0, a1, e0, e1 = arc.held_out
-            eyes.append(_eye(arc, a0 + (a1 - a0) * t, e0 + (e1 - e0) * (0.5 - 0.5 * np.cos(np.pi * t)), arc.distance))
+            back = arc.distance * (1 + 2 * blend * (1 - blend))
+            eyes.append(_eye(arc, a0 + (a1 - a0) * t, e0 + (e1 - e0) * (0.5 - 0.5 * np.cos(np.pi * t)), back))
         eye = (1 - blend) * eyes[0] + blend * eyes[1]
         target = (1 - blend) * np.asarray(ends[0].target) + blend * np.asarray(ends[1].target)
         path.append(camera_at(eye, target, width, height))

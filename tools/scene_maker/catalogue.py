@@ -8,7 +8,7 @@ from catacaustics.errors import UserError
 from scene_maker import textures as tx
 from scene_maker.model import Arcs, Reflector, SceneModel
 from scene_maker.rooms import Brush, garden, room, table, tableware
-from scene_maker.solids import Surface, bent_sheet, box, ellipsoid, joined, panel, revolved, sheet, tube, with_texture
+from scene_maker.solids import Surface, bent_sheet, box, ellipsoid, joined, revolved, sheet, tube, with_texture
 
 TOP = 0.72
 """Height of the table top."""
@@ -35,15 +35,14 @@ def vase(brush: Brush) -> SceneModel:
 
     # Radius and height from inside the neck over the lip to the foot.
     knots = np.array([[0.045, 0.40], [0.055, 0.45], [0.075, 0.478], [0.092, 0.475], [0.082, 0.452], [0.064, 0.41],
-                      [0.085, 0.36], [0.135, 0.28], [0.152, 0.2], [0.132, 0.11], [0.094, 0.04], [0.09, 0.0]])  # fmt: skip
+                      [0.085, 0.36], [0.135, 0.28], [0.152, 0.2], [0.132, 0.11], [0.094, 0.04], [0.09, 0]])  # fmt: skip
     along = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(knots, axis=0), axis=1))])
     profile = CubicSpline(along, knots)(np.linspace(0, along[-1], 160))
     foot = (0.0, 0.0, TOP + 0.004)
     surfaces, lights = room(brush)
     surfaces += [*table(brush), *tableware(brush)]
-    paint = brush(tx.shapes, [(24, 50, 96), (40, 92, 150), (226, 222, 206), (190, 60, 44), (232, 176, 70)], 0.5)(
-        512, 1024
-    )
+    palette = [(16, 30, 66), (22, 52, 104), (38, 84, 128), (20, 60, 84), (176, 140, 70), (150, 60, 50)]
+    paint = brush(tx.shapes, palette, 0.25)(512, 1024)
     geometry = {"type": "revolution", "center": list(foot), "axis": [0, 0, 1], "profile": profile.round(6).tolist()}
     glazed = Reflector("vase", geometry, revolved(profile, 192).moved(foot), (1.0, 1.0, 1.0), paint)
     return SceneModel(surfaces, lights, [glazed], [Arcs((0, 0, TOP + 0.22), 0.95, held_out=(40, 270, 14, 38))])
@@ -54,7 +53,7 @@ def bowl(brush: Brush) -> SceneModel:
     radius, half_angle = 0.27, np.radians(68)
     center = (0.0, 0.0, TOP + 0.035 + radius)
     surfaces, lights = room(brush)
-    surfaces += [*table(brush), *tableware(brush), _foot(brush, 0.045)]
+    surfaces += [*table(brush), *tableware(brush), _foot(brush, 0.04)]
     geometry = {"type": "spherical_cap", "center": list(center), "radius": radius, "axis": [0, 0, -1],
                 "half_angle_degrees": 68.0}  # fmt: skip
     shell = ellipsoid((radius,) * 3, 160, 384, (np.pi - half_angle, np.pi)).moved(center)
@@ -79,18 +78,19 @@ def kettle(brush: Brush) -> SceneModel:
     center, radii = np.array([0.0, 0.0, TOP + 0.17]), (0.19, 0.19, 0.155)
     turn = np.linspace(0, np.pi, 48)
     handle = np.stack([0.14 * np.cos(turn), 0 * turn, 0.1 + 0.15 * np.sin(turn)], -1)
-    t = np.linspace(0, 1, 48)
+    t = 1 - np.linspace(1, 0, 96) ** 1.5
     spout = np.stack([0.13 + 0.17 * t, 0 * t, -0.05 + 0.2 * t**1.7], -1)
+    spout_radius = (0.045 - 0.024 * t) * np.sqrt(np.clip((1.0001 - t) / 0.04, 0, 1))  # rounded off at its end
     knob = ellipsoid((0.03, 0.03, 0.026), 32, 64).moved((0, 0, 0.172))
     lid = ellipsoid((0.085, 0.085, 0.022), 32, 96).moved((0, 0, 0.142))
-    parts = [ellipsoid(radii, 160, 320), tube(handle, np.full(48, 0.014)), tube(spout, 0.045 - 0.024 * t), knob, lid]
+    parts = [ellipsoid(radii, 160, 320), tube(handle, np.full(48, 0.014)), tube(spout, spout_radius), knob, lid]
     geometry = {"type": "ellipsoid", "center": center.tolist(), "radii": list(radii), "rotation": np.eye(3).tolist(),
                 "note": "the body; handle, lid and spout are in the mesh"}  # fmt: skip
     surfaces = [*garden(brush), *table(brush), *tableware(brush), _foot(brush, 0.03)]
     steel = Reflector("kettle", geometry, joined(parts).moved(center))
     sky = tx.sky(brush.rng, 512, 1024, (0.31, 0.27))
     arcs = Arcs((0, 0, TOP + 0.19), 1.0, (8, 26, 46))
-    return SceneModel(surfaces, [], [steel], [arcs], sky)
+    return SceneModel(surfaces, [], [steel], [arcs], sky, 1.25)
 
 
 def mirror(brush: Brush) -> SceneModel:
@@ -101,7 +101,7 @@ def mirror(brush: Brush) -> SceneModel:
     frame = brush(tx.planks, tx.WOOD)
     surfaces += [*table(brush), *tableware(brush, reach=0.36)]
     surfaces += box((0, y + 0.014, TOP + 0.003), (width + 0.08, 0.024, height + 0.08), frame, density=500)
-    surfaces += box((0, y + 0.05, TOP + 0.003), (0.3, 0.12, 0.06), frame, density=500)
+    surfaces += box((0, y + 0.09, TOP + 0.003), (0.3, 0.12, 0.06), frame, density=500)
     corner, right, down = (left, y, base + height), (width, 0, 0), (0, 0, -height)
     corners = [corner, (left + width, y, base + height), (left + width, y, base), (left, y, base)]
     glass = Reflector("mirror", {"type": "plane", "corners": [list(c) for c in corners]}, sheet(corner, right, down))

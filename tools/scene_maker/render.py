@@ -16,14 +16,21 @@ from catacaustics.errors import UserError
 from catacaustics.geometry import rigid_inverse
 from catacaustics.shapes import Bool, Float, Int
 from scene_maker.model import Light, Reflector, SceneModel
-from scene_maker.solids import Mesh, atlas, merged
+from scene_maker.solids import Mesh, Surface, atlas, merged, sheet
 
 VARIANTS = ("auto", "cuda_ad_rgb", "llvm_ad_rgb", "scalar_rgb")
 MAX_BOUNCES = 12
 LIGHT_CELL = 4
 """Side in texels of the cells for which light is path-traced: 1 to 2 cm."""
 SAMPLES_AT_ONCE = 4
-_LLVM_REMEDY = "install the LLVM library (Debian, Ubuntu: `apt-get install -y libllvm15`), or use --variant scalar_rgb"
+BLACK = {"type": "conductor", "specular_reflectance": {"type": "rgb", "value": 0.0}}
+"""What emits and reflects nothing: a mirror rather than a diffuse surface, so that no light is sampled in vain."""
+OLDEST_LLVM = 17
+"""Older ones end the whole process on some processors: "Cannot select fminimum"."""
+_LLVM_REMEDY = (
+    f"install the library of LLVM {OLDEST_LLVM} or newer (Debian, Ubuntu: `apt-get install -y libllvm19`), "
+    "or use --variant scalar_rgb"
+)
 
 
 def choose_variant(variant: str = "auto") -> str:
@@ -35,6 +42,7 @@ def choose_variant(variant: str = "auto") -> str:
     if variant not in VARIANTS:
         raise UserError(f"There is no variant {variant}.", f"one of {', '.join(VARIANTS)}", "name one of them")
     try:
+        import drjit as dr
         import mitsuba as mi
     except ImportError as error:
         raise UserError(
@@ -45,12 +53,14 @@ def choose_variant(variant: str = "auto") -> str:
         try:
             mi.set_variant(name)
             np.array(mi.Float(1.0) + 1.0)  # the compiler or driver is looked for only now
+            if name == "llvm_ad_rgb" and (version := dr.detail.llvm_version())[0] < OLDEST_LLVM:
+                raise RuntimeError(f"LLVM {version[0]} is too old")
         except (RuntimeError, ImportError) as error:
             problems.append(f"{name}: {str(error).strip().splitlines()[-1]}")
             continue
         if name == "scalar_rgb" and variant == "auto":
             print(
-                f"No LLVM library found: rendering with scalar_rgb, which is slow. To go faster, {_LLVM_REMEDY}.",
+                f"No usable LLVM library: rendering with scalar_rgb, which is slow. To go faster, {_LLVM_REMEDY}.",
                 file=sys.stderr,
             )
         return name
@@ -94,26 +104,19 @@ def _texture(image: np.ndarray) -> dict[str, Any]:
     return {"type": "bitmap", "bitmap": mi.Bitmap(np.ascontiguousarray(image)), "wrap_mode": "clamp"}
 
 
-def _light(light: Light) -> Any:
+def _lamp(light: Light) -> Surface:
+    """A light as a surface whose texture is the radiance it emits."""
+    view = np.ones((8, 8, 3)) if light.view is None else light.view
+    return Surface(sheet(light.top_left, light.right, light.down), (view * light.radiance).astype(np.float32))
+
+
+def _glowing(name: str, surfaces: list[Surface], radiance: list[np.ndarray], atlas_width: int) -> Any:
+    """Surfaces as one mesh that emits: one emitter, because the order of several differs from run to run."""
     import mitsuba as mi
 
-    radiance: dict[str, Any] = {"type": "rgb", "value": list(light.radiance)}
-    if light.view is not None:
-        # v runs down a bitmap, but up a rectangle.
-        image = np.ascontiguousarray((light.view[::-1] * np.asarray(light.radiance)).astype(np.float32))
-        radiance = {"type": "bitmap", "bitmap": mi.Bitmap(image), "raw": True, "wrap_mode": "clamp"}
-    # A rectangle is the analytic square [-1, 1]^2 with its front along +z.
-    right, down = np.asarray(light.right, float), np.asarray(light.down, float)
-    matrix = np.eye(4)
-    matrix[:3, 0], matrix[:3, 1] = right / 2, -down / 2
-    matrix[:3, 2] = np.cross(right, -down) / np.linalg.norm(np.cross(right, down))
-    matrix[:3, 3] = np.asarray(light.top_left) + right / 2 + down / 2
-    return {
-        "type": "rectangle",
-        "to_world": mi.ScalarTransform4f(matrix),
-        "emitter": {"type": "area", "radiance": radiance},
-        "bsdf": {"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.5}},
-    }
+    image = {"type": "bitmap", "bitmap": mi.Bitmap(atlas(surfaces, radiance, atlas_width)), "raw": True}
+    emitter = mi.load_dict({"type": "area", "radiance": image | {"wrap_mode": "clamp"}})
+    return _mesh(name, merged(surfaces, atlas_width), mi.load_dict(BLACK), emitter)
 
 
 def _reflector(reflector: Reflector) -> Any:
@@ -162,25 +165,26 @@ class Renderer:
         import mitsuba as mi
 
         self.model = model
-        self._places = merged(model.surfaces)
+        self._lamps = [_lamp(light) for light in model.lights]
         paint = _texture(atlas(model.surfaces, [s.texture for s in model.surfaces]))
-        self.scene = self._load(
-            _mesh("surroundings", self._places, mi.load_dict({"type": "diffuse", "reflectance": paint}))
-        )
+        diffuse = mi.load_dict({"type": "diffuse", "reflectance": paint})
+        parts = {"surroundings": _mesh("surroundings", merged(model.surfaces), diffuse)}
+        if self._lamps:
+            parts["lamps"] = _glowing("lamps", self._lamps, [lamp.texture for lamp in self._lamps], 512)
+        self.scene = self._load(parts)
         self._lit = None
         by_name = {shape.id(): shape for shape in self.scene.shapes()}
         self._reflectors = [by_name[f"reflector_{i}"] for i in range(len(model.reflectors))]
 
-    def _load(self, surroundings: Any) -> Any:
+    def _load(self, parts: dict[str, Any]) -> Any:
         import mitsuba as mi
 
-        scene: dict[str, Any] = {"type": "scene", "surroundings": surroundings}
-        scene |= {f"light_{i}": _light(light) for i, light in enumerate(self.model.lights)}
+        scene: dict[str, Any] = {"type": "scene"} | parts
         scene |= {f"reflector_{i}": _reflector(r) for i, r in enumerate(self.model.reflectors)}
         if self.model.sky is not None:
             turn = mi.ScalarTransform4f().rotate([1, 0, 0], 90)  # Mitsuba's maps have y up
             scene["sky"] = {"type": "envmap", "bitmap": mi.Bitmap(self.model.sky), "to_world": turn}
-        return mi.load_dict(scene)
+        return mi.load_dict(scene, parallel=False)
 
     def irradiance(self, samples: int, seed: int) -> list[Float[np.ndarray, "rows columns 3"]]:
         """Radiance of each surface were it white, in cells of LIGHT_CELL x LIGHT_CELL texels (irradiance over pi)."""
@@ -196,30 +200,31 @@ class Renderer:
         import mitsuba as mi
 
         integrator = mi.load_dict({"type": "path", "max_depth": self.model.max_depth, "rr_depth": 4})
-        sensor = mi.load_dict({"type": "perspective"})
-        total, pixels = np.zeros(positions.shape), len(positions)
-        scalar = mi.variant().startswith("scalar")
+        sampler = mi.load_dict({"type": "independent"})
+        total = np.zeros(positions.shape)
         for start in range(0, samples, SAMPLES_AT_ONCE):
             count = min(SAMPLES_AT_ONCE, samples - start)
-            eyes = np.repeat(positions + 1e-3 * normals, count, 0)
-            looks = np.repeat(-normals, count, 0)
-            sampler = mi.load_dict({"type": "independent"})
-            sampler.seed(seed * 100003 + start, 1 if scalar else len(eyes))
-            if scalar:
-                light = np.array(
-                    [self._radiance(integrator, sampler, sensor, e, d) for e, d in zip(eyes, looks, strict=True)]
-                )
+            eyes, looks = np.repeat(positions + 1e-3 * normals, count, 0), np.repeat(-normals, count, 0)
+            first = seed * 100003 + start
+            if mi.variant().startswith("scalar"):
+                light = np.empty(eyes.shape)
+                for k in range(len(eyes)):
+                    sampler.seed(first + samples * k, 1)
+                    light[k] = self._radiance(integrator, sampler, eyes[k], looks[k])
             else:
-                light = np.array(self._radiance(integrator, sampler, sensor, eyes.T, looks.T)).T
-            total += light.reshape(pixels, count, 3).sum(1)
+                sampler.seed(first, len(eyes))
+                light = np.array(self._radiance(integrator, sampler, eyes.T, looks.T)).T
+            total += light.reshape(len(positions), count, 3).sum(1)
         return total / samples
 
-    def _radiance(self, integrator: Any, sampler: Any, sensor: Any, eye: np.ndarray, look: np.ndarray) -> Any:
+    def _radiance(self, integrator: Any, sampler: Any, eye: np.ndarray, look: np.ndarray) -> Any:
         import drjit as dr
         import mitsuba as mi
 
         ray = mi.RayDifferential3f(mi.Point3f(eye.astype(np.float32)), mi.Vector3f(look.astype(np.float32)))
         hit = self.scene.ray_intersect(ray)
+        if mi.variant().startswith("scalar") and not hit.is_valid():
+            return mi.Color3f(0)  # one ray that met nothing has no material to ask
         white = dr.maximum(hit.bsdf(ray).eval_diffuse_reflectance(hit), 1e-3)
         light = integrator.sample(self.scene, sampler, ray)[0] / white
         return dr.select(hit.is_valid() & (hit.t < 2e-3), light, 0)
@@ -227,7 +232,6 @@ class Renderer:
     def illuminate(self, irradiance: list[Float[np.ndarray, "rows columns 3"]]) -> None:
         """Make every diffuse surface emit what it reflects."""
         import cv2
-        import mitsuba as mi
 
         glow = []
         for surface, light in zip(self.model.surfaces, irradiance, strict=True):
@@ -237,11 +241,8 @@ class Renderer:
             full = cv2.resize(smooth, (columns * LIGHT_CELL, rows * LIGHT_CELL), interpolation=cv2.INTER_LINEAR)
             full = cv2.resize(full, (width, height), interpolation=cv2.INTER_LINEAR)
             glow.append(full * _linear(surface.texture))
-        image = mi.Bitmap(atlas(self.model.surfaces, glow))
-        radiance = {"type": "bitmap", "bitmap": image, "raw": True, "wrap_mode": "clamp"}
-        black = mi.load_dict({"type": "diffuse", "reflectance": {"type": "rgb", "value": 0.0}})
-        emitter = mi.load_dict({"type": "area", "radiance": radiance})
-        self._lit = self._load(_mesh("surroundings", self._places, black, emitter))
+        surfaces, glow = [*self.model.surfaces, *self._lamps], [*glow, *(lamp.texture for lamp in self._lamps)]
+        self._lit = self._load({"surroundings": _glowing("surroundings", surfaces, glow, 4096)})
 
     def photograph(self, camera: Camera, samples: int, seed: int) -> Float[np.ndarray, "height width 3"]:
         """A view as linear radiance times exposure, path-traced with a box filter. `illuminate` first."""
@@ -331,7 +332,9 @@ class Renderer:
         import mitsuba as mi
 
         hit = self.scene.ray_intersect(mi.Ray3f(origin, direction))
+        scalar = mi.variant().startswith("scalar")  # scalar variants have the shapes themselves
         reflector = mi.Int32(-1)
         for i, shape in enumerate(self._reflectors):
-            reflector = dr.select(hit.is_valid() & (hit.shape == mi.ShapePtr(shape)), i, reflector)
+            same = hit.shape == (shape if scalar else mi.ShapePtr(shape))
+            reflector = dr.select(hit.is_valid() & same, i, reflector)
         return hit.t, hit.sh_frame.n, reflector

@@ -104,7 +104,7 @@ def room(brush: Brush, x: float = 2.75, y: float = 2.5, height: float = 2.7) -> 
     for at, size in (((x - 0.04, 0, 0.86), (2.05, 0.07, 0.07)), ((x - 0.04, 0, 2.27), (2.05, 0.07, 0.07))):
         surfaces += box(at, size, frame, np.pi / 2)
     view = tx.window(brush.rng, 260, 380)
-    lights = [Light((x - 0.02, 0.98, 2.28), (0, -1.96, 0), (0, 0, -1.36), (7.0, 7.0, 7.0), view)]
+    lights = [Light((x - 0.02, 0.98, 2.28), (0, -1.96, 0), (0, 0, -1.36), (5.5, 5.5, 5.5), view)]
     for at in (-0.65, 0.65):
         for side in (-1.2, 0.5):
             corner = (at - 0.3, side, height - 0.01)
@@ -134,7 +134,7 @@ def tableware(brush: Brush, top: float = 0.72, reach: float = 0.42, center: floa
         front = brush(tx.label, words[i], tx.BRIGHT)
         size = (0.15, 0.07, brush.rng.uniform(0.08, 0.13)) if i % 2 else (0.2, 0.15, 0.045)
         yaw = turn + np.pi / 2 + brush.rng.uniform(-0.3, 0.3)
-        things += box(place, size, brush(tx.shapes, tx.BRIGHT), yaw, 600, front)
+        things += box(place, size, brush(tx.shapes, tx.BRIGHT, 0.35), yaw, 600, front)
     cup = revolved(np.array([[0.0, 0.015], [0.034, 0.02], [0.04, 0.085], [0.043, 0.085], [0.04, 0.0], [0.0, 0.0]]))
     for turn, palette in ((1.45, tx.COOL), (3.0, tx.WARM), (4.7, tx.GREEN)):
         place = (center + reach * 1.02 * np.cos(turn), reach * 1.02 * np.sin(turn), top + 0.002)
@@ -148,7 +148,7 @@ def garden(brush: Brush) -> list[Surface]:
     shapes = partial(brush, tx.shapes)
     surfaces = [
         panel((-45, 45, -0.03), (90, 0, 0), (0, -90, 0), brush(tx.shapes, tx.GREEN, 1.4), 22),
-        panel((-3.5, 3.5, 0), (7, 0, 0), (0, -7, 0), brush(tx.mosaic, [*tx.STONE, *tx.WARM], 42), 170),
+        panel((-3.5, 3.5, 0), (7, 0, 0), (0, -7, 0), brush(tx.mosaic, [*tx.STONE, *tx.CREAM[:3], tx.WARM[1]], 42), 170),
     ]
     words = [["APPLES", "PEARS"], ["MIND", "THE", "DOG"], ["GATE 4"], ["EGGS", "TODAY"]]
     for i, turn in enumerate(np.radians([20.0, 112.0, 197.0, 290.0])):

@@ -178,8 +178,10 @@ def tube(path: Float[np.ndarray, "k 3"], radius: Float[np.ndarray, "k"], segment
     side = normalize(side - tangent * (tangent @ side)[:, None])
     other = np.cross(tangent, side)
     angle = np.linspace(0, 2 * np.pi, segments + 1)
-    normals = np.cos(angle)[None, :, None] * side[:, None] + np.sin(angle)[None, :, None] * other[:, None]
-    points = path[:, None] + normals * radius[:, None, None]
+    spokes = np.cos(angle)[None, :, None] * side[:, None] + np.sin(angle)[None, :, None] * other[:, None]
+    points = path[:, None] + spokes * radius[:, None, None]
+    slope = np.gradient(radius) / np.linalg.norm(np.gradient(path, axis=0), axis=1)
+    normals = normalize(spokes - (slope[:, None] * tangent)[:, None])
     return _lattice(points, normals, len(path), segments + 1)
 
 

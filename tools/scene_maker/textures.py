@@ -50,7 +50,7 @@ def _grain(rng: Rng, image: np.ndarray, amount: float = 0.3) -> Image:
     height, width = image.shape[:2]
     fine = noise(rng, height, width, 16, 4) - 0.5
     coarse = noise(rng, height, width, max(height, width) / 3, 5) - 0.5
-    return np.clip(image * (1 + amount * 1.6 * fine + amount * coarse)[..., None], 0, 255).astype(np.uint8)
+    return np.clip(image * (1 + amount * fine + amount * coarse)[..., None], 0, 255).astype(np.uint8)
 
 
 def _pick(rng: Rng, palette: Palette) -> tuple[int, int, int]:
@@ -77,7 +77,9 @@ def shapes(rng: Rng, height: int, width: int, palette: Palette, density: float =
 
     image = np.ascontiguousarray(_colors(noise(rng, height, width, min(height, width) / 2, 5), palette))
     scale = min(height, width, 700)
-    for radius in (scale / 5, scale / 9, scale / 16, scale / 30, scale / 60):
+    for radius in (scale / 5, scale / 9, scale / 16, scale / 28):
+        if radius < 3:
+            break
         count = int(density * 0.16 * height * width / radius**2)
         for _ in range(count):
             center = rng.random(2) * (width, height)
@@ -175,7 +177,7 @@ def poster(rng: Rng, height: int, width: int, lines: Sequence[str], palette: Pal
     sheet = _colors(0.6 + 0.4 * noise(rng, height, width, 90, 4), [(120, 110, 100), *CREAM[2:4]])
     image = np.ascontiguousarray(sheet.astype(np.uint8))
     strip = height // 4
-    image[-strip:] = shapes(rng, strip, width, palette, 1.2)
+    image[-strip:] = shapes(rng, strip, width, palette, 0.5)
     edge = max(min(height, width) // 28, 3)
     tall = (height - strip - 2 * edge) // len(lines)
     for i, line in enumerate(lines):
@@ -227,7 +229,7 @@ def books(rng: Rng, height: int, width: int, shelves: int = 4) -> Image:
 
 def label(rng: Rng, height: int, width: int, text: str, palette: Palette) -> Image:
     """A printed packet: shapes with a word across the middle."""
-    image = shapes(rng, height, width, palette, 0.7).astype(np.float32)
+    image = shapes(rng, height, width, palette, 0.4).astype(np.float32)
     band = slice(int(height * 0.3), int(height * 0.7))
     image[band] = 0.25 * image[band] + 0.75 * np.array(_pick(rng, CREAM))
     image = image.astype(np.uint8)
