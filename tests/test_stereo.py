@@ -338,6 +338,16 @@ def test_fusion_of_maps_that_contradict_each_other_returns_nothing(tmp_path):
     assert len(fuse_exact_maps(tmp_path, [0.3, -1, 0.2], scales=(1, 1.1, 1.2, 1.3, 1.4))) == 0
 
 
+def test_points_in_empty_space_are_removed_and_points_of_hidden_surfaces_stay(tmp_path):
+    cameras = [(f"{index}.png", camera) for index, camera in enumerate(cross())]
+    for name, camera in cameras:
+        fusion.write_map(fusion.map_paths(tmp_path, name)[0], render(camera, [plane((0, 1, 0), 0.0)])[1])
+    positions = np.float32([[0, 0, 0], [0, -0.5, 0], [0, 0.5, 0], [50, 0, 0], [0, -9, 0]])
+    cloud = PointCloud(positions, np.zeros_like(positions), np.zeros_like(positions))
+    kept = fusion.remove_contradicted(cloud, tmp_path, "photometric", cameras)
+    np.testing.assert_array_equal(kept.positions, positions[[0, 2, 3, 4]])
+
+
 def test_lone_points_are_removed():
     rng = np.random.default_rng(0)
     positions = np.concatenate([rng.uniform(0, 1, (2000, 3)) * [1, 1, 0], [[0.5, 0.5, 3.0]]]).astype(np.float32)

@@ -71,6 +71,20 @@ def map_paths(workspace: Path, name: str, kind: str = "photometric") -> tuple[Pa
     return stereo / "depth_maps" / f"{name}.{kind}.bin", stereo / "normal_maps" / f"{name}.{kind}.bin"
 
 
+def in_frame(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Whether points are in a camera's frame, their pixels and depths."""
+    pixels, depth = camera.project(points)
+    inside = (depth > 0) & (pixels >= 0).all(-1) & (pixels < [camera.width, camera.height]).all(-1)
+    return inside, pixels, depth
+
+
+def look_up(depth_map: np.ndarray, camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """A depth map's values where points are seen (0 where they are not, or it has none), and the points' depths."""
+    inside, pixels, depth = in_frame(camera.resized(depth_map.shape[1], depth_map.shape[0]), points)
+    columns, rows = np.where(inside[..., None], pixels, 0).astype(int).T
+    return np.where(inside, depth_map[rows, columns], 0), depth
+
+
 def write_overlap_model(workspace: Path, views: list[tuple[str, Camera]], points: Float[np.ndarray, "n 3"]) -> None:
     """Write the workspace's model: every point is tracked in every view that has it in its frame.
 
@@ -86,8 +100,8 @@ def write_overlap_model(workspace: Path, views: list[tuple[str, Camera]], points
                 model="PINHOLE", width=camera.width, height=camera.height, params=parameters, camera_id=number
             )
         )
-        pixels, depth = camera.project(points)
-        inside = np.flatnonzero((depth > 0) & (pixels > 0).all(1) & (pixels < [camera.width, camera.height]).all(1))
+        seen, pixels, _ = in_frame(camera, points)
+        inside = np.flatnonzero(seen)
         image = pycolmap.Image(name=name, keypoints=pixels[inside], camera_id=number, image_id=number)
         model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(camera.camera_from_world[:3]))
         for place, index in enumerate(inside):
@@ -141,6 +155,24 @@ def _quiet(pycolmap):
         yield
     finally:
         pycolmap.logging.minloglevel = level
+
+
+def remove_contradicted(
+    cloud: PointCloud, workspace: Path, kind: str, views: list[tuple[str, Camera]], tolerance: float = 0.03
+) -> PointCloud:
+    """Drop points that float in empty space: more views see through them than see them.
+
+    Args:
+        views: names and cameras of the maps.
+        tolerance: relative difference from a view's depth up to which it sees the point.
+    """
+    balance = np.zeros(len(cloud), int)
+    positions = cloud.positions.astype(np.float64)
+    for name, camera in views:
+        seen, depth = look_up(read_map(map_paths(workspace, name, kind)[0]), camera, positions)
+        ratio = seen[seen > 0] / depth[seen > 0]
+        balance[seen > 0] += (np.abs(ratio - 1) < tolerance).astype(int) - (ratio >= 1 + tolerance)
+    return cloud.select(balance >= 0)
 
 
 def remove_outliers(cloud: PointCloud, neighbors: int = 20, deviations: float = 2.0) -> PointCloud:

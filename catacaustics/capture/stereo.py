@@ -24,8 +24,11 @@ from catacaustics.capture.dataset import Capture
 from catacaustics.capture.fusion import (
     fuse_maps,
     import_pycolmap,
+    in_frame,
+    look_up,
     map_paths,
     read_map,
+    remove_contradicted,
     remove_outliers,
     write_map,
     write_overlap_model,
@@ -90,7 +93,8 @@ def fuse_capture(
         kind = "photometric"
     stereo.write_masks()
     min_views = min(MIN_VIEWS, len(capture.train))
-    cloud = remove_outliers(fuse_maps(stereo.folder, kind, min_views, MAX_DEPTH_ERROR, MAX_NORMAL_ERROR))
+    cloud = fuse_maps(stereo.folder, kind, min_views, MAX_DEPTH_ERROR, MAX_NORMAL_ERROR)
+    cloud = remove_outliers(remove_contradicted(cloud, stereo.folder, kind, stereo.named_cameras))
     if not len(cloud):
         raise UserError(
             f"Multi-view stereo on {capture.root} left no points: no {min_views} views agree on any surface.",
@@ -106,6 +110,7 @@ class _Stereo:
     def __init__(self, capture: Capture, max_size: int, sparse_points: np.ndarray | None):
         self.capture, self.views = capture, capture.train
         self.cameras = [_reduced(view.camera, max_size) for view in self.views]
+        self.named_cameras = [(view.name, camera) for view, camera in zip(self.views, self.cameras, strict=True)]
         self.config = SweepConfig()
         self.device = torch.device("cuda" if torch.cuda.is_available() else "cpu")
         self.folder = capture.root / "work" / "stereo" / self._key(sparse_points)
@@ -234,8 +239,7 @@ class _Stereo:
 
     def _prepare(self, points: Float[np.ndarray, "n 3"]) -> None:
         """Write the workspace's photographs and model."""
-        names = [view.name for view in self.views]
-        write_overlap_model(self.folder, list(zip(names, self.cameras, strict=True)), _sample(points, 3000))
+        write_overlap_model(self.folder, self.named_cameras, _sample(points, 3000))
         for view, camera in zip(self.views, self.cameras, strict=True):
             path = self.folder / "images" / view.name
             if not path.is_file():
@@ -266,19 +270,10 @@ def _sample(points: np.ndarray, count: int) -> np.ndarray:
     return points if len(points) <= count else points[np.random.default_rng(0).permutation(len(points))[:count]]
 
 
-def _inside(camera: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Whether points are in the frame, their pixels and depths."""
-    pixels, depth = camera.project(points)
-    inside = (depth > 0) & (pixels >= 0).all(-1) & (pixels < [camera.width, camera.height]).all(-1)
-    return inside, pixels, depth
-
-
 def _agrees(points: np.ndarray, camera: Camera, depth_map: np.ndarray, tolerance: float = 0.04) -> np.ndarray:
     """Whether a view's depth map has the points on its surface, within a relative tolerance."""
-    inside, pixels, depth = _inside(camera.resized(depth_map.shape[1], depth_map.shape[0]), points)
-    columns, rows = np.where(inside[..., None], pixels, 0).astype(int).T
-    seen = depth_map[rows, columns]
-    return inside & (seen > 0) & (np.abs(seen - depth) < tolerance * depth)
+    seen, depth = look_up(depth_map, camera, points)
+    return (seen > 0) & (np.abs(seen - depth) < tolerance * depth)
 
 
 def _angle_weight(angle: np.ndarray) -> np.ndarray:
@@ -322,7 +317,7 @@ def choose_neighbors(
     Occlusion is not known here; that is why several are chosen and only the best count in each pixel.
     """
     centers = np.stack([camera.center for camera in cameras])
-    seen = np.stack([_inside(camera, points)[0] for camera in cameras])
+    seen = np.stack([in_frame(camera, points)[0] for camera in cameras])
     chosen = []
     for index in range(len(cameras)):
         visible = points[seen[index]]
@@ -343,7 +338,7 @@ def depth_range(camera: Camera, points: Float[np.ndarray, "n 3"]) -> tuple[float
 
     None where hardly any point is in the frame.
     """
-    inside, _, depth = _inside(camera, points)
+    inside, _, depth = in_frame(camera, points)
     if inside.sum() < 8:
         return None
     low, high = np.percentile(1 / depth[inside], [0.5, 99.5])
@@ -371,7 +366,7 @@ def _guess(cameras: list[Camera], index: int) -> tuple[list[int], tuple[float, f
     grid = pixel_centers(camera.viewport)[:: max(1, camera.height // 5), :: max(1, camera.width // 5)].reshape(-1, 2)
     points = camera.unproject(np.tile(grid, (len(depths), 1)), np.repeat(depths, len(grid)))
     sight = normalize(points[None] - centers[:, None])
-    seen = np.stack([_inside(other, points)[0] for other in cameras])
+    seen = np.stack([in_frame(other, points)[0] for other in cameras])
     worth = (_angle_weight(_angles(sight, sight[index])) * seen).reshape(len(cameras), len(depths), -1)
     worth[index] = 0
     support = np.sort(worth.mean(-1), 0)[-NEIGHBORS:].sum(0)
