@@ -1,5 +1,6 @@
 import dataclasses
 import importlib.util
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -348,13 +349,15 @@ def test_points_in_empty_space_are_removed_and_points_of_hidden_surfaces_stay(tm
     np.testing.assert_array_equal(kept.positions, positions[[0, 2, 3, 4]])
 
 
-def test_lone_points_are_removed():
+def test_lone_points_are_removed_with_open3d_and_without(monkeypatch):
     rng = np.random.default_rng(0)
     positions = np.concatenate([rng.uniform(0, 1, (2000, 3)) * [1, 1, 0], [[0.5, 0.5, 3.0]]]).astype(np.float32)
     cloud = PointCloud(positions, np.tile(np.float32([0, 0, 1]), (2001, 1)), np.zeros_like(positions))
     kept = fusion.remove_outliers(cloud)
     assert kept.positions[:, 2].max() == 0
     assert len(kept) > 1900
+    monkeypatch.setitem(sys.modules, "open3d", None)
+    np.testing.assert_array_equal(fusion.remove_outliers(cloud).positions, kept.positions)
 
 
 def test_a_capture_of_one_view_is_refused(tmp_path):

@@ -176,22 +176,26 @@ def remove_contradicted(
 
 
 def remove_outliers(cloud: PointCloud, neighbors: int = 20, deviations: float = 2.0) -> PointCloud:
-    """Drop points that lie farther from their nearest neighbours than is usual (Open3D's statistical outliers).
+    """Drop points that lie farther from their nearest neighbours than is usual: Open3D's statistical outliers.
 
-    Raises:
-        UserError: Open3D is not installed or does not load.
+    Open3D's wheels do not load on systems without libusb and libGL; there SciPy finds the same points.
     """
     if len(cloud) <= neighbors:
         return cloud
+    positions = cloud.positions.astype(np.float64)
     try:
         import open3d as o3d
-    except (ImportError, OSError) as error:
-        raise UserError(
-            f"Open3D cannot be loaded: {error}.",
-            "Open3D 0.18 or newer and the system libraries it uses",
-            'pip install "open3d>=0.18", and on Debian or Ubuntu: apt-get install libusb-1.0-0 libgl1 libgomp1; '
-            "then run the same command again: the depth maps are kept",
-        ) from error
-    points = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(cloud.positions.astype(np.float64)))
-    _, kept = points.remove_statistical_outlier(neighbors, deviations)
+    except (ImportError, OSError):
+        return cloud.select(_usual_distance(positions, neighbors, deviations))
+    _, kept = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(positions)).remove_statistical_outlier(
+        neighbors, deviations
+    )
     return cloud.select(np.asarray(kept, dtype=np.int64))
+
+
+def _usual_distance(positions: Float[np.ndarray, "n 3"], neighbors: int, deviations: float) -> np.ndarray:
+    """Whether the mean distance to the nearest points, itself included, is at most so many deviations over the mean."""
+    from scipy.spatial import KDTree
+
+    distance = KDTree(positions).query(positions, neighbors)[0].mean(1)
+    return distance < distance.mean() + deviations * distance.std(ddof=1)
