@@ -7,13 +7,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from toy import ball_mask, make_toy_capture
+
 from catacaustics.cameras import Camera
 from catacaustics.capture.colmap import ColmapCamera, read_model, write_model
 from catacaustics.capture.dataset import View
 from catacaustics.capture.importers import import_capture, importable, read_source, read_transforms
 from catacaustics.capture.undistort import distort
 from catacaustics.errors import UserError
-from catacaustics.files import write_json
+from catacaustics.files import read_json, write_json
 from catacaustics.geometry import look_at, rigid_inverse, transform
 from catacaustics.images import read_image_bytes, read_mask, write_image
 
@@ -344,3 +346,13 @@ def test_a_sphere_is_found_from_three_circles_and_painted_in_every_view(tmp_path
         np.testing.assert_allclose([x.min(), y.min()], outline.min(0), atol=1.2)
         np.testing.assert_allclose([x.max() + 1, y.max() + 1], outline.max(0), atol=1.2)
         assert mask.sum() == pytest.approx(np.pi * np.prod(np.ptp(outline, axis=0)) / 4, rel=0.02)
+
+
+def test_masks_and_split_beside_the_cameras_come_along(tmp_path):
+    source = make_toy_capture(tmp_path / "source")
+    split = read_json(source / "split.json")
+    capture = import_capture(source, tmp_path / "capture")
+    assert [v.name for v in capture.held_out] == split["held_out"]
+    assert capture.reflectors == ["ball"]
+    view = capture.held_out[0]
+    np.testing.assert_array_equal(capture.mask(view, "ball"), ball_mask(view.camera))

@@ -81,13 +81,13 @@ def import_capture(
 ) -> Capture:
     """Make a capture of calibrated photographs: undistorted photographs and masks, cameras, sparse points, a split.
 
-    A second call skips finished photographs; a split.json that names the same views is kept. There is no dense cloud
-    yet (points.ply).
+    A second call skips finished photographs; a split.json that names the same views, in the capture or beside the
+    source's cameras, is kept. There is no dense cloud yet (points.ply).
 
     Args:
         source: see `read_source`.
         capture: folder to write.
-        masks: MASKS/REFLECTOR/STEM.png at the size of the photographs.
+        masks: MASKS/REFLECTOR/STEM.png at the size of the photographs; by default the source's folder masks/, if any.
         max_size: longer side of the undistorted photographs.
         held_out_every: every n-th view in name order is held out.
 
@@ -95,13 +95,16 @@ def import_capture(
         UserError: see `read_source` and `undistort_views`.
     """
     model, photos = read_source(source)
+    folder = Path(source) if Path(source).is_dir() else Path(source).parent
+    if masks is None and (folder / "masks").is_dir():
+        masks = folder / "masks"
     views = undistort_views(model, photos, masks, capture, max_size)
     split = default_split([view.name for view in views], held_out_every)
-    split_path = Path(capture) / "split.json"
-    if split_path.is_file():
-        old = read_json(split_path)
+    for path in (Path(capture) / "split.json", folder / "split.json"):
+        old = read_json(path) if path.is_file() else None
         if _split_names(old) == _split_names(split):
             split = old
+            break
     write_capture(capture, views, split, model.points, model.colors)
     return open_capture(capture)
 
