@@ -14,9 +14,10 @@ from catacaustics.cameras import Camera, pixel_centers
 from catacaustics.capture.truth import Truth
 from catacaustics.errors import UserError
 from catacaustics.geometry import rigid_inverse
+from catacaustics.images import resize
 from catacaustics.shapes import Bool, Float, Int
 from scene_maker.model import Light, Reflector, SceneModel
-from scene_maker.solids import Mesh, Surface, atlas, merged, sheet
+from scene_maker.solids import DENSITY, Mesh, Surface, atlas, merged, sheet
 
 VARIANTS = ("auto", "cuda_ad_rgb", "llvm_ad_rgb", "scalar_rgb")
 MAX_BOUNCES = 12
@@ -105,8 +106,12 @@ def _texture(image: np.ndarray) -> dict[str, Any]:
 
 
 def _lamp(light: Light) -> Surface:
-    """A light as a surface whose texture is the radiance it emits."""
-    view = np.ones((8, 8, 3)) if light.view is None else light.view
+    """A light as a surface whose texture is the radiance it emits.
+
+    Mitsuba picks points of a light by the brightness of texels: texels must be of one size on all lights.
+    """
+    width, height = (max(round(DENSITY * float(np.linalg.norm(v))), 8) for v in (light.right, light.down))
+    view = np.ones((height, width, 3)) if light.view is None else resize(light.view, width, height)
     return Surface(sheet(light.top_left, light.right, light.down), (view * light.radiance).astype(np.float32))
 
 
