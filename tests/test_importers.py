@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-
 from toy import ball_mask, make_toy_capture
 
 from catacaustics.cameras import Camera
