@@ -104,7 +104,7 @@ def difference(a: np.ndarray, b: np.ndarray, depth: float) -> tuple[float, float
 
 def agree(a: np.ndarray, b: np.ndarray, depth: float) -> bool:
     apart, angle = difference(a, b, depth)
-    return apart < AGREE and angle < AGREE_ANGLE
+    return bool(apart < AGREE and angle < AGREE_ANGLE)
 
 
 def correspondences(
@@ -130,8 +130,10 @@ def correspondences(
         return np.zeros(0, int), np.zeros(0, int), np.zeros(0, int)
     table = np.concatenate(rows).astype(int)
     table = table[marks.seen[table[:, 1]].sum(1) - marks.seen[table[:, 1], view] >= 2]
+    # Of the views that offer the same pair any one is taken, so that the halves of the views stay even.
+    table = np.random.default_rng(0).permutation(table)
     _, unique = np.unique(table[:, :2], axis=0, return_index=True)
-    table = table[np.sort(unique)]
+    table = table[unique]
     return table[:, 0], table[:, 1], table[:, 2]
 
 

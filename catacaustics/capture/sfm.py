@@ -239,7 +239,7 @@ class Features:
     """Features of all photographs, by index: pixel coordinates and 128-byte SIFT descriptors; and the identifiers
     of their images and cameras in the database."""
 
-    keypoints: list[Float[np.ndarray, "n 2"]]
+    keypoints: list[Float[np.ndarray, "_ 2"]]
     descriptors: list[np.ndarray]
     image_ids: list[int]
     camera_ids: list[int]
@@ -324,7 +324,7 @@ def read_matches(database: Path, features: Features) -> dict[tuple[int, int], np
     with pycolmap.Database.open(database) as db:
         for pair_id, matches in zip(*db.read_all_matches(), strict=True):
             i, j = (index[k] for k in pycolmap.pair_id_to_image_pair(pair_id))
-            matches = np.asarray(matches)
+            matches = np.asarray(matches).astype(np.int64)
             if len(matches) >= MIN_INLIERS:
                 result[min(i, j), max(i, j)] = matches if i < j else matches[:, ::-1]
     return result
@@ -461,7 +461,7 @@ def registered(model: Any, features: Features) -> dict[int, Float[np.ndarray, "4
 
 def epipolar_matches(
     poses: dict[int, np.ndarray],
-    rays: list[Float[np.ndarray, "n 2"]],
+    rays: list[Float[np.ndarray, "_ 2"]],
     matches: dict[tuple[int, int], np.ndarray],
     focal: float,
     tolerance: float,
@@ -490,7 +490,7 @@ def epipolar_matches(
     return result
 
 
-def feature_rays(model: Any, features: Features) -> list[Float[np.ndarray, "n 2"]]:
+def feature_rays(model: Any, features: Features) -> list[Float[np.ndarray, "_ 2"]]:
     """Undistorted coordinates (x / z, y / z) of all features."""
     return [
         np.asarray(model.cameras[c].cam_from_img(k)) if len(k) else np.zeros((0, 2))

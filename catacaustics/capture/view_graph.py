@@ -128,7 +128,7 @@ def vote_rotations(
     weights: Float[np.ndarray, "m"],
     n: int,
     tolerance: float = 1.6 * TOLERANCES[0],
-    trials: int = 1000,
+    trials: int = 400,
     seed: int = 0,
 ) -> tuple[Float[np.ndarray, "n 3 3"], Bool[np.ndarray, "m"]]:
     """RANSAC over spanning trees: the rotations that most edges, by weight, agree with.
