@@ -65,7 +65,7 @@ def write_truth(root: Path, view_name: str, truth: Truth, source_step: float = 1
     depth_scale = float(inverse.max()) or 1.0
     # 0 means no surface, hence the steps 1 to 65535.
     depth = np.where(found, np.maximum(np.rint(inverse / depth_scale * 65535), 1), 0)
-    reached = np.isfinite(truth.source).all(-1)
+    reached: np.ndarray = np.asarray(np.isfinite(truth.source).all(-1))
     sources = truth.source[reached] if reached.any() else np.zeros((1, 3))
     low = sources.min(0)
     step = max(source_step, float((sources.max(0) - low).max()) / 65535)

@@ -6,9 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from scene_maker.solids import Mesh, Surface
-
-Vector = Sequence[float]
+from scene_maker.solids import Mesh, Surface, Vector
 
 
 @dataclass(frozen=True, eq=False)

@@ -69,6 +69,13 @@ def choose_variant(variant: str = "auto") -> str:
     raise UserError(f"Mitsuba cannot start {'; '.join(problems)}.", "a working Mitsuba variant", remedy)
 
 
+def _scalar() -> bool:
+    """Whether rays are traced one by one."""
+    import mitsuba as mi
+
+    return str(mi.variant()).startswith("scalar")
+
+
 def _mesh(name: str, mesh: Mesh, bsdf: Any, emitter: Any = None) -> Any:
     import mitsuba as mi
 
@@ -211,7 +218,7 @@ class Renderer:
             count = min(SAMPLES_AT_ONCE, samples - start)
             eyes, looks = np.repeat(positions + 1e-3 * normals, count, 0), np.repeat(-normals, count, 0)
             first = seed * 100003 + start
-            if mi.variant().startswith("scalar"):
+            if _scalar():
                 light = np.empty(eyes.shape)
                 for k in range(len(eyes)):
                     sampler.seed(first + samples * k, 1)
@@ -228,7 +235,7 @@ class Renderer:
 
         ray = mi.RayDifferential3f(mi.Point3f(eye.astype(np.float32)), mi.Vector3f(look.astype(np.float32)))
         hit = self.scene.ray_intersect(ray)
-        if mi.variant().startswith("scalar") and not hit.is_valid():
+        if _scalar() and not hit.is_valid():
             return mi.Color3f(0)  # one ray that met nothing has no material to ask
         white = dr.maximum(hit.bsdf(ray).eval_diffuse_reflectance(hit), 1e-3)
         light = integrator.sample(self.scene, sampler, ray)[0] / white
@@ -275,7 +282,7 @@ class Renderer:
             }
         )
         integrator = mi.load_dict({"type": "path", "max_depth": MAX_BOUNCES + 1, "rr_depth": MAX_BOUNCES})
-        image = mi.render(self._lit, sensor=sensor, integrator=integrator, spp=samples, seed=seed)
+        image = mi.render(self._lit, sensor=sensor, integrator=integrator, spp=samples, seed=mi.UInt32(seed))
         return np.array(image) * self.model.exposure
 
     def truth(self, camera: Camera) -> tuple[Truth, Int[np.ndarray, "height width"]]:
@@ -318,7 +325,7 @@ class Renderer:
         import mitsuba as mi
 
         directions = directions / np.linalg.norm(directions, axis=-1, keepdims=True)
-        if mi.variant().startswith("scalar"):
+        if _scalar():
             rows = [self._intersect(mi.Point3f(o), mi.Vector3f(d)) for o, d in zip(origins, directions, strict=True)]
             distance, normal, reflector = (np.array(column) for column in zip(*rows, strict=True))
             normal = normal.reshape(-1, 3)
@@ -337,7 +344,7 @@ class Renderer:
         import mitsuba as mi
 
         hit = self.scene.ray_intersect(mi.Ray3f(origin, direction))
-        scalar = mi.variant().startswith("scalar")  # scalar variants have the shapes themselves
+        scalar = _scalar()  # scalar variants have the shapes themselves
         reflector = mi.Int32(-1)
         for i, shape in enumerate(self._reflectors):
             same = hit.shape == (shape if scalar else mi.ShapePtr(shape))

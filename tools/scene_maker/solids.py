@@ -12,6 +12,7 @@ import numpy as np
 from catacaustics.geometry import normalize
 from catacaustics.shapes import Float, Int, UInt8
 
+Vector = Sequence[float] | np.ndarray
 Texture = Callable[[int, int], np.ndarray]
 """Draws a texture of (height, width) pixels."""
 
@@ -32,7 +33,7 @@ class Mesh:
     faces: Int[np.ndarray, "m 3"]
     lattice: tuple[int, int] | None = None
 
-    def moved(self, center: Sequence[float], yaw: float = 0.0, tilt: float = 0.0) -> "Mesh":
+    def moved(self, center: Vector, yaw: float = 0.0, tilt: float = 0.0) -> "Mesh":
         """Tilted about x, turned about z (radians), then moved."""
         ct, st, cy, sy = np.cos(tilt), np.sin(tilt), np.cos(yaw), np.sin(yaw)
         rotation = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]]) @ np.array([[1, 0, 0], [0, ct, -st], [0, st, ct]])
@@ -69,7 +70,7 @@ class Surface:
             found.append((1 - a) * upper + a * lower)
         return found[0], normalize(found[1])
 
-    def moved(self, center: Sequence[float], yaw: float = 0.0, tilt: float = 0.0) -> "Surface":
+    def moved(self, center: Vector, yaw: float = 0.0, tilt: float = 0.0) -> "Surface":
         return Surface(self.mesh.moved(center, yaw, tilt), self.texture)
 
 
@@ -99,7 +100,7 @@ def _lattice(points: np.ndarray, normals: np.ndarray, rows: int, columns: int) -
     )
 
 
-def sheet(top_left: Sequence[float], right: Sequence[float], down: Sequence[float]) -> Mesh:
+def sheet(top_left: Vector, right: Vector, down: Vector) -> Mesh:
     """A flat rectangle seen from its front: its top left corner and the vectors along its top and left edges."""
     o, r, d = (np.asarray(v, float) for v in (top_left, right, down))
     normal = np.broadcast_to(normalize(np.cross(d, r)), (4, 3))
@@ -108,9 +109,9 @@ def sheet(top_left: Sequence[float], right: Sequence[float], down: Sequence[floa
 
 
 def panel(
-    top_left: Sequence[float],
-    right: Sequence[float],
-    down: Sequence[float],
+    top_left: Vector,
+    right: Vector,
+    down: Vector,
     texture: Texture,
     density: float = DENSITY,
 ) -> Surface:
@@ -120,8 +121,8 @@ def panel(
 
 
 def box(
-    center: Sequence[float],
-    size: Sequence[float],
+    center: Vector,
+    size: Vector,
     texture: Texture,
     yaw: float = 0.0,
     density: float = DENSITY,
@@ -137,7 +138,7 @@ def box(
         ([-x, y, z], [2 * x, 0, 0], [0, -2 * y, 0], texture),
         ([-x, -y, 0], [2 * x, 0, 0], [0, 2 * y, 0], texture),
     ]
-    return [panel(*face, density).moved(center, yaw) for face in faces]
+    return [panel(corner, right, down, draw, density).moved(center, yaw) for corner, right, down, draw in faces]
 
 
 def revolved(profile: Float[np.ndarray, "k 2"], segments: int = 64) -> Mesh:
@@ -154,9 +155,7 @@ def revolved(profile: Float[np.ndarray, "k 2"], segments: int = 64) -> Mesh:
     return _lattice(points, normalize(normals), *shape)
 
 
-def ellipsoid(
-    radii: Sequence[float], rows: int = 48, segments: int = 96, polar: tuple[float, float] = (0.0, np.pi)
-) -> Mesh:
+def ellipsoid(radii: Vector, rows: int = 48, segments: int = 96, polar: tuple[float, float] = (0.0, np.pi)) -> Mesh:
     """An ellipsoid about the origin with exact normals, or the zone of it between two angles from the z axis."""
     p, a = np.meshgrid(np.linspace(*polar, rows + 1), np.linspace(0, 2 * np.pi, segments + 1), indexing="ij")
     unit = np.stack([np.sin(p) * np.cos(a), np.sin(p) * np.sin(a), np.cos(p)], -1)

@@ -55,7 +55,8 @@ def _grain(rng: Rng, image: np.ndarray, amount: float = 0.3) -> Image:
 
 def _pick(rng: Rng, palette: Palette) -> tuple[int, int, int]:
     jitter = rng.integers(-18, 19, 3)
-    return tuple(int(v) for v in np.clip(np.array(palette[rng.integers(len(palette))]) + jitter, 0, 255))
+    red, green, blue = np.clip(np.array(palette[int(rng.integers(len(palette)))]) + jitter, 0, 255).tolist()
+    return red, green, blue
 
 
 def _blob(rng: Rng, center: np.ndarray, radius: float) -> np.ndarray:
@@ -145,7 +146,7 @@ def planks(rng: Rng, height: int, width: int, palette: Palette = WOOD, plank: in
 
 def mosaic(rng: Rng, height: int, width: int, palette: Palette, cell: float = 40) -> Image:
     """Irregular tiles (Voronoi cells of jittered points) with dark joints: pavement, tiled tables."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     rows, columns = int(height / cell) + 2, int(width / cell) + 2
     grid = np.stack(np.meshgrid(np.arange(columns), np.arange(rows)), -1).reshape(-1, 2) + rng.random(
@@ -153,7 +154,7 @@ def mosaic(rng: Rng, height: int, width: int, palette: Palette, cell: float = 40
     )
     sites = (grid - 0.5) * cell
     pixels = np.stack(np.meshgrid(np.arange(width), np.arange(height)), -1).reshape(-1, 2)
-    distance, owner = cKDTree(sites).query(pixels, k=2)
+    distance, owner = (np.asarray(found) for found in KDTree(sites).query(pixels, k=2))
     colors = np.array([_pick(rng, palette) for _ in sites], np.float32)
     joint = np.where(distance[:, 1] - distance[:, 0] < cell * 0.08, 0.45, 1.0)
     return _grain(rng, (colors[owner[:, 0]] * joint[:, None]).reshape(height, width, 3), 0.3)
