@@ -218,12 +218,12 @@ def _solve_cameras(photos: list[sfm.Photo], config: CalibrateConfig, work: Path)
         features,
         matches,
     )
+    if model is None:
+        raise _too_few(sum(c.good for c in checks), len(photos))
     if config.masks is not None:
         model, checks, changes = _check_silhouettes(model, checks, changes, photos, config, features, matches, work)
     for change in changes:
         print(f"  {photos[change.index].name} {change.action}: {change.reason}", flush=True)
-    if model.num_reg_images() < 3:
-        raise _too_few(model.num_reg_images(), len(photos))
     return _Solution(_full_size(model, photos, features, copies), checks, changes)
 
 
@@ -280,8 +280,9 @@ def _check_silhouettes(
     poses = sfm.registered(model, features)
     for change in disagreeing:
         poses.pop(change.index)
-    if len(poses) >= 3:
-        model = sfm.rebuild(dict(model.cameras), poses, features, matches, work / "matches.db", work / "photos")
+    if len(poses) < 3:
+        raise _too_few(len(poses), len(photos))
+    model = sfm.rebuild(dict(model.cameras), poses, features, matches, work / "matches.db", work / "photos")
     return model, checks, [*changes, *disagreeing]
 
 

@@ -238,7 +238,7 @@ def repair(
     features: Features,
     matches: dict[tuple[int, int], np.ndarray],
     rounds: int = 6,
-) -> tuple[Any, list[CameraCheck], list[Change]]:
+) -> tuple[Any | None, list[CameraCheck], list[Change]]:
     """Check every camera, move or drop what disagrees, add what can be localised clearly, rebuild, and again until
     nothing changes.
 
@@ -248,9 +248,10 @@ def repair(
         rebuild: from cameras by identifier and poses by photograph to a model (`sfm.rebuild`).
 
     Returns:
-        The model, the last check of every photograph, and the changes in order.
+        The model, or None where fewer than 3 cameras stand; the last check of every photograph; the changes in order.
     """
     changes: list[Change] = []
+    results: list[tuple[CameraCheck, Hypothesis | None]] = []
     model = rebuild(dict(model.cameras), registered(model, features))
     for number in range(rounds + 1):
         marks = Landmarks(model, features)
@@ -274,7 +275,7 @@ def repair(
             break
         changes += fresh
         if len(poses) < 3:
-            break
+            return None, [check for check, _ in results], changes
         model = rebuild(dict(model.cameras), poses)
     return model, [check for check, _ in results], changes
 

@@ -268,7 +268,8 @@ def global_descriptors(descriptors: list[np.ndarray], words: int = 32, seed: int
     words = min(words, max(len(pool) // 10, 1))
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", UserWarning)  # a word that no feature speaks does no harm
-        centers, _ = kmeans2(pool[rng.permutation(len(pool))[:20000]], words, 10, minit="points", seed=rng)
+        pool = pool[rng.permutation(len(pool))[:20000]]
+        centers, _ = kmeans2(pool, pool[:words].copy(), 10, minit="matrix")
     result = np.zeros((len(samples), words, pool.shape[1]), np.float32)
     for row, sample in zip(result, samples, strict=True):
         if len(sample):
@@ -427,7 +428,11 @@ def map_incrementally(database: Path, copies: Path, folder: Path, seed: int = 0)
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     models = pycolmap.incremental_mapping(database, copies, folder, options)
-    return max(models.values(), key=lambda m: (m.num_reg_images(), m.num_points3D()), default=None)
+    return _largest(models)
+
+
+def _largest(models: dict[int, Any]) -> Any | None:
+    return max(models.values(), key=lambda m: (m.num_reg_images(), m.num_points3D())) if models else None
 
 
 def map_globally(database: Path, copies: Path, folder: Path, seed: int = 0) -> Any | None:
@@ -444,7 +449,7 @@ def map_globally(database: Path, copies: Path, folder: Path, seed: int = 0) -> A
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     models = pycolmap.global_mapping(database, copies, folder, options)
-    return max(models.values(), key=lambda m: (m.num_reg_images(), m.num_points3D()), default=None)
+    return _largest(models)
 
 
 def registered(model: Any, features: Features) -> dict[int, Float[np.ndarray, "4 4"]]:
