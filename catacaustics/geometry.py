@@ -63,7 +63,7 @@ def look_at(
 def rotation_angle(rotation: Float[np.ndarray, "*batch 3 3"]) -> Float[np.ndarray, "*batch"]:
     """Angle of a rotation in radians, accurate near 0 too: |R - I|_F = 2 sqrt(2) sin(angle / 2)."""
     half_sine = np.linalg.norm(rotation - np.eye(3), axis=(-2, -1)) / (2 * np.sqrt(2))
-    return 2 * np.arcsin(np.clip(half_sine, 0, 1))
+    return np.asarray(2 * np.arcsin(np.clip(half_sine, 0, 1)))
 
 
 def fit_similarity(source: Float[np.ndarray, "n 3"], target: Float[np.ndarray, "n 3"]) -> Similarity:
