@@ -25,29 +25,36 @@ def _stereo() -> str:
     return "plane sweep in PyTorch (this pycolmap has no CUDA; a CUDA build would use COLMAP PatchMatch)"
 
 
-def _splat_self_test() -> str:
-    """Seconds for a small forward and backward, or what went wrong."""
+def _splat_self_test(backend: str) -> str:
+    """How a backend was built and its time for a small forward and backward pass, or what is wrong with it."""
     import time
 
     import numpy as np
     import torch
 
     from catacaustics.cameras import Camera
-    from catacaustics.splatting import splat_points
+    from catacaustics.splatting import native, splat_points
 
+    built = "PyTorch"
+    if backend == "cpu":
+        library, problem = native.find_library()
+        if library is None:
+            return f"not available: {problem}"
+        built = library.description
     generator = torch.Generator().manual_seed(0)
     positions = torch.rand(2000, 3, generator=generator) + torch.tensor([-0.5, -0.5, 1.0])
     positions.requires_grad_()
     normals = torch.tensor([0.0, 0.0, -1.0]).expand(2000, 3)
+    camera = Camera(160, 120, 120.0, 120.0, 80.0, 60.0, np.eye(4))
     values = torch.full((2000,), 1e-4), torch.full((2000,), 0.5), torch.ones(2000, 3)
     start = time.perf_counter()
-    output = splat_points(positions, normals, *values, Camera(160, 120, 120.0, 120.0, 80.0, 60.0, np.eye(4)))
+    output = splat_points(positions, normals, *values, camera, backend=backend)
     output.image.sum().backward()
     seconds = time.perf_counter() - start
     total = float(output.image.detach()[..., 0].mean() + output.transmittance.detach().mean())
     if abs(total - 1) > 1e-4 or positions.grad is None or not torch.isfinite(positions.grad).all():
-        return f"FAILED: opacity and transmittance add up to {total:.6f} instead of 1"
-    return f"ok, {1000 * seconds:.0f} ms forward and backward (2000 splats, 160 x 120)"
+        return f"FAILED ({built}): opacity and transmittance add up to {total:.6f} instead of 1"
+    return f"ok ({built}), {1000 * seconds:.0f} ms forward and backward (2000 splats, 160 x 120)"
 
 
 def doctor(config: DoctorConfig) -> None:
@@ -62,7 +69,8 @@ def doctor(config: DoctorConfig) -> None:
         ("processor", f"{os.cpu_count()} cores, torch uses {torch.get_num_threads()} threads, {memory:.0f} GiB"),
         ("GPU", cuda),
         ("free disk here", f"{shutil.disk_usage('.').free / 2**30:.0f} GiB"),
-        ("splatter: reference", _splat_self_test()),
+        ("splatter: reference", _splat_self_test("reference")),
+        ("splatter: cpu", _splat_self_test("cpu")),
         ("multi-view stereo", _stereo()),
     ]
     packages = ["torch", "numpy", "scipy", "pycolmap", "open3d", "opencv-contrib-python-headless", "torchmetrics"]

@@ -12,6 +12,7 @@ from catacaustics.geometry import look_at
 from catacaustics.splatting import splat_points
 from catacaustics.splatting.reference import tangent_basis
 
+pytestmark = pytest.mark.usefixtures("backend")
 WIDE = SplatConfig(support=8.0)
 NAMES = ("positions", "normals", "footprints", "opacities", "features")
 

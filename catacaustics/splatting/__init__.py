@@ -1,5 +1,90 @@
-"""EWA splatting of oriented disks."""
+"""EWA splatting of oriented disks: one entry, several backends that compute the same."""
 
-from catacaustics.splatting.reference import SplatOutput, points_in_view, splat_points
+import functools
+import logging
+import os
+from typing import Literal
 
-__all__ = ["SplatOutput", "points_in_view", "splat_points"]
+from torch import Tensor
+
+from catacaustics.cameras import Camera, Viewport
+from catacaustics.config import SplatConfig
+from catacaustics.errors import UserError
+from catacaustics.shapes import Float
+from catacaustics.splatting import native, reference
+from catacaustics.splatting.reference import SplatOutput, points_in_view
+
+__all__ = ["Backend", "SplatOutput", "backend_for", "points_in_view", "splat_points"]
+
+Backend = Literal["auto", "reference", "cpu"]
+_CHOICE = "CATACAUSTICS_SPLATTER"
+
+
+@functools.cache
+def _say_once(message: str) -> None:
+    logging.getLogger("catacaustics").warning(message)
+
+
+def backend_for(device: str, backend: Backend | None = None) -> str:
+    """The backend that splats tensors of a device: `cpu` (native code) or `reference` (PyTorch).
+
+    Args:
+        device: "cpu" or "cuda".
+        backend: which one to take; None asks the environment variable CATACAUSTICS_SPLATTER. auto takes the fastest
+            there is, and says so once where that is the reference.
+
+    Raises:
+        UserError: no such backend, or it does not run here.
+    """
+    choice = backend or os.environ.get(_CHOICE) or "auto"
+    if choice not in ("auto", "reference", "cpu"):
+        raise UserError(f"splatter backend {choice!r}", "auto, reference or cpu", f"check {_CHOICE} in the environment")
+    if choice == "reference":
+        return "reference"
+    if choice == "cpu" and device != "cpu":
+        raise UserError("splatter backend cpu for tensors on " + device, "tensors on the CPU", "use backend auto")
+    problem = native.find_library().problem if device == "cpu" else f"there is none for {device}"
+    if not problem:
+        return "cpu"
+    if choice == "cpu":
+        raise UserError(
+            f"no native splatter: {problem}",
+            "the libraries that the build installs into catacaustics/_native",
+            "install the package again with a C++17 compiler, or use backend auto",
+        )
+    _say_once(f"splatting in PyTorch, which is many times slower than native code: {problem}")
+    return "reference"
+
+
+def splat_points(
+    positions: Float[Tensor, "n 3"],
+    normals: Float[Tensor, "n 3"],
+    footprints: Float[Tensor, "n"],
+    opacities: Float[Tensor, "n"],
+    features: Float[Tensor, "n channels"],
+    camera: Camera,
+    viewport: Viewport | None = None,
+    config: SplatConfig | None = None,
+    backend: Backend | None = None,
+) -> SplatOutput:
+    """Splat oriented disks into a viewport; differentiable in every tensor.
+
+    Points at equal depth keep their input order. The colour is not normalised and has no background: blend one with
+    `transmittance`.
+
+    Args:
+        positions, normals: world space; normals of unit length.
+        footprints: squared radii, world units squared, non-negative.
+        opacities: in [0, 1].
+        camera: pinhole camera in world units.
+        viewport: pixels to compute; the whole image by default.
+        backend: see `backend_for`.
+
+    Raises:
+        ValueError: wrong shapes, types or devices, values that are not finite or out of range; the argument is named.
+        UserError: the backend does not run here.
+    """
+    splat = {"cpu": native.splat_points, "reference": reference.splat_points}[
+        backend_for(positions.device.type, backend)
+    ]
+    return splat(positions, normals, footprints, opacities, features, camera, viewport, config)

@@ -356,7 +356,8 @@ def splat_points(
     """
     config = config or SplatConfig()
     viewport = viewport or camera.viewport
-    _check(positions, normals, footprints, opacities, features)
+    check_shapes(positions, normals, footprints, opacities, features)
+    check_values(positions=positions, normals=normals, footprints=footprints, opacities=opacities, features=features)
     pose = torch.tensor(camera.camera_from_world, dtype=positions.dtype, device=positions.device)
     lens = ((camera.fx, camera.fy), (camera.cx, camera.cy))
     with torch.no_grad():
@@ -406,7 +407,8 @@ def _reach2(opacities: Tensor, config: SplatConfig) -> Tensor:
     return reach2
 
 
-def _check(positions: Tensor, normals: Tensor, footprints: Tensor, opacities: Tensor, features: Tensor) -> None:
+def check_shapes(positions: Tensor, normals: Tensor, footprints: Tensor, opacities: Tensor, features: Tensor) -> None:
+    """Raise ValueError, naming the argument, for shapes, types and devices that do not go together."""
     n = len(positions)
     expected = {
         "positions": (positions, (n, 3)),
@@ -422,17 +424,21 @@ def _check(positions: Tensor, normals: Tensor, footprints: Tensor, opacities: Te
             raise ValueError(f"{name} must be float32 or float64 like positions, got {tensor.dtype}")
         if tensor.device != positions.device:
             raise ValueError(f"{name} must be on {positions.device} like positions, got {tensor.device}")
+
+
+def check_values(**tensors: Tensor) -> None:
+    """Raise ValueError for values that are not finite or out of range: which argument, how many, the first's place."""
+    for name, tensor in tensors.items():
         finite = torch.isfinite(tensor)
         if not finite.all():
             bad = torch.nonzero(~finite)
             raise ValueError(f"{name} has {len(bad)} values that are not finite, the first at {bad[0].tolist()}")
-    for name, bad in (("footprints must be >= 0", footprints < 0), ("opacities must be <= 1", opacities > 1)):
-        if bad.any():
-            raise ValueError(f"{name}: {int(bad.sum())} are not, the first at [{int(torch.nonzero(bad)[0])}]")
-    if (opacities < 0).any():
-        raise ValueError(
-            f"opacities must be >= 0: the first that is not is at [{int(torch.nonzero(opacities < 0)[0])}]"
-        )
+    rules = {"footprints": [(">= 0", torch.lt, 0)], "opacities": [(">= 0", torch.lt, 0), ("<= 1", torch.gt, 1)]}
+    for name, tensor in tensors.items():
+        for wanted, outside, limit in rules.get(name, []):
+            bad = torch.nonzero(outside(tensor, limit))
+            if len(bad):
+                raise ValueError(f"{name} must be {wanted}: {len(bad)} are not, the first at {bad[0].tolist()}")
 
 
 def points_in_view(

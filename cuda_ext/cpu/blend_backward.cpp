@@ -1,0 +1,271 @@
+#include <cstring>
+#include <memory>
+#include <vector>
+
+#include "abi.h"
+#include "tile.h"
+
+namespace catacaustics {
+namespace {
+
+// Gradients of a splat from one tile, before they are summed over its tiles: kGeometry values, then the features'.
+constexpr int kGeometry = 6;
+// Such gradients held at a time.
+constexpr int64_t kBatchBytes = int64_t(1) << 27;
+
+inline int64_t gradient_stride(int channels) { return (kGeometry + channels + 7) / 8 * 8; }
+
+template <class S>
+struct Gradients {
+    const S *g_image, *g_transmittance;
+    S *means, *forms, *opacities, *features;
+};
+
+template <class S, int C>
+struct BackwardTile {
+    using P = Pack<S>;
+    using Shape = TileShape<S>;
+    // Blocks of pairs held at a time; 1 byte and two packs each.
+    static constexpr int kStored = 1 << 14;
+
+    struct StoredPairs {
+        alignas(64) S falloff[Shape::lanes], through[Shape::lanes];
+    };
+    // Transmittance in front of an entry from which a later sweep starts again.
+    struct Checkpoint {
+        int64_t entry;
+        alignas(64) S through[Shape::blocks][Shape::lanes];
+    };
+
+    LaneCoordinates<S> at;
+    alignas(64) S g_image[Shape::blocks][C > 0 ? C : 1][Shape::lanes];
+    alignas(64) S behind[Shape::blocks][Shape::lanes];
+    alignas(64) S through[Shape::blocks][Shape::lanes];
+    StoredPairs pairs[kStored];
+    uint8_t blocks[kStored + 8];
+    std::vector<int> starts;  // of an entry's pairs
+    std::vector<Checkpoint> checkpoints;
+
+    // Front to back from entry `from`, storing the pairs, until they fill the store; returns the entry after the last.
+    int64_t sweep(const Bins<S>& bins, const int32_t* entries, int64_t from, int64_t count, S tile_x, S tile_y) {
+        starts.clear();
+        starts.push_back(0);
+        int stored = 0;
+        for (; from < count && stored + Shape::blocks <= kStored; ++from) {
+            if (from + 8 < count) prefetch(bins.record(entries[from + 8]));
+            const Record<S>& record = *reinterpret_cast<const Record<S>*>(bins.record(entries[from]));
+            const TileSplat<S> splat(record, tile_x, tile_y);
+            const int end = stored + list_blocks(at, record, splat.x, splat.y, blocks + stored);
+            for (; stored < end; ++stored) {
+                const int block = blocks[stored];
+                const P falloff = splat.falloff(splat.offset(at, block));
+                P t = P::load(through[block]);
+                t.store(pairs[stored].through);
+                falloff.store(pairs[stored].falloff);
+                blend_step(P(splat.opacity), falloff, t);
+                t.store(through[block]);
+            }
+            starts.push_back(stored);
+        }
+        return from;
+    }
+
+    static void prefetch(const S* record) {
+        const char* bytes = reinterpret_cast<const char*>(record);
+        for (int64_t line = 0; line < record_stride(C) * int64_t(sizeof(S)); line += 64)
+            __builtin_prefetch(bytes + line);
+    }
+
+    // Writes the gradients of every entry of the tile.
+    void blend(const Bins<S>& bins, int64_t tile, S tile_x, S tile_y, S* out) {
+        const int32_t* entries = bins.begin(tile);
+        const int64_t count = bins.end(tile) - entries;
+        for (auto& block : through) P(S(1)).store(block);
+        checkpoints.clear();
+        for (int64_t entry = 0; entry < count;) {
+            checkpoints.emplace_back();
+            checkpoints.back().entry = entry;
+            std::memcpy(checkpoints.back().through, through, sizeof through);
+            entry = sweep(bins, entries, entry, count, tile_x, tile_y);
+        }
+        int64_t end = count;
+        for (std::size_t k = checkpoints.size(); k-- > 0;) {
+            const int64_t begin = checkpoints[k].entry;
+            if (end < count) {
+                std::memcpy(through, checkpoints[k].through, sizeof through);
+                sweep(bins, entries, begin, end, tile_x, tile_y);
+            }
+            for (int64_t entry = end; entry-- > begin;) {
+                if (entry >= begin + 4) prefetch(bins.record(entries[entry - 4]));
+                const S* data = bins.record(entries[entry]);
+                blend_splat(
+                    *reinterpret_cast<const Record<S>*>(data), data + kHeader, starts[entry - begin],
+                    starts[entry - begin + 1], tile_x, tile_y, out + entry * gradient_stride(C));
+            }
+            end = begin;
+        }
+    }
+
+    CATACAUSTICS_HD void blend_splat(
+        const Record<S>& record, const S* features, int first, int end, S tile_x, S tile_y, S* out) {
+        const TileSplat<S> splat(record, tile_x, tile_y);
+        const P opacity(splat.opacity), zero(S(0));
+        P feature[C > 0 ? C : 1], sums[kGeometry + C];
+        for (int c = 0; c < C; ++c) feature[c] = P(features[c]);
+        for (auto& sum : sums) sum = zero;
+        PairSums<P> geometry{zero, zero, zero, zero, zero, zero};
+        for (int i = first; i < end; ++i) {
+            const int block = blocks[i];
+            const P falloff = P::load(pairs[i].falloff), t = P::load(pairs[i].through);
+            const P weight = opacity * falloff * t;
+            P color = zero;
+            for (int c = 0; c < C; ++c) {
+                const P g = P::load(g_image[block][c]);
+                color = color + g * feature[c];
+                sums[kGeometry + c] = sums[kGeometry + c] + weight * g;
+            }
+            P r = P::load(behind[block]);
+            const P h = blend_step_backward(opacity, falloff, t, color, r);
+            r.store(behind[block]);
+            const auto d = splat.offset(at, block);
+            add_pair(geometry, h, d.skew, d.dy);
+        }
+        sums[0] = geometry.h;
+        sums[1] = geometry.skew;
+        sums[2] = geometry.dy;
+        sums[3] = geometry.skew2;
+        sums[4] = geometry.skew_dy;
+        sums[5] = geometry.dy2;
+        sum_lanes<S, kGeometry + C>(sums, out);
+        const PairSums<S> total{out[0], out[1], out[2], out[3], out[4], out[5]};
+        const SplatGradient<S> g = splat_gradient(total, record.opacity, record.w(), record.m, record.v());
+        out[0] = g.mean_x;
+        out[1] = g.mean_y;
+        out[2] = g.w;
+        out[3] = g.m;
+        out[4] = g.v;
+        out[5] = g.opacity;
+    }
+};
+
+// Adds up the gradients of a batch's entries splat by splat, over tiles in order.
+template <class S>
+void reduce(
+    const Bins<S>& bins, int64_t first_tile, int64_t last_tile, int threads, const S* entry_gradients,
+    const Splats<S>& splats, int first_channel, int channels, const Gradients<S>& out) {
+    const int64_t stride = gradient_stride(channels), chunk = 4096;
+    const int64_t chunks = (splats.count + chunk - 1) / chunk, parts = std::min<int64_t>(chunks, 4 * threads);
+    parallel_for(threads, parts, [&](int64_t part) {
+        const int64_t begin = chunks * part / parts * chunk;
+        const int64_t end = std::min(splats.count, chunks * (part + 1) / parts * chunk);
+        std::vector<const int32_t*> next(last_tile - first_tile);
+        for (int64_t tile = first_tile; tile < last_tile; ++tile)
+            next[tile - first_tile] = std::lower_bound(bins.begin(tile), bins.end(tile), int32_t(begin));
+        Scratch<S> sums(chunk * stride);
+        for (int64_t low = begin; low < end; low += chunk) {
+            const int64_t high = std::min(end, low + chunk);
+            std::memset(sums.data(), 0, (high - low) * stride * sizeof(S));
+            for (int64_t tile = first_tile; tile < last_tile; ++tile) {
+                const int32_t *entry = next[tile - first_tile], *tile_end = bins.end(tile);
+                const S* from = entry_gradients + (bins.offset(tile) + (entry - bins.begin(tile))) * stride;
+                for (; entry < tile_end && *entry < high; ++entry, from += stride) {
+                    S* to = sums.data() + (*entry - low) * stride;
+                    for (int64_t k = 0; k < stride; ++k) to[k] += from[k];
+                }
+                next[tile - first_tile] = entry;
+            }
+            for (int64_t i = low; i < high; ++i) {
+                const S* sum = sums.data() + (i - low) * stride;
+                const int64_t point = splats.visible[i];
+                for (int k = 0; k < 2; ++k) out.means[2 * i + k] += sum[k];
+                for (int k = 0; k < 3; ++k) out.forms[3 * i + k] += sum[2 + k];
+                out.opacities[point] += sum[5];
+                S* features = out.features + point * splats.channels + first_channel;
+                for (int c = 0; c < channels; ++c) features[c] += sum[kGeometry + c];
+            }
+        }
+    });
+}
+
+template <class S, int C>
+void blend_tiles(
+    const Bins<S>& bins, int64_t first_tile, int64_t last_tile, int threads, const Splats<S>& splats, int first_channel,
+    const Gradients<S>& gradients, S* entry_gradients) {
+    using Shape = TileShape<S>;
+    const Window& w = bins.window;
+    parallel_for(threads, last_tile - first_tile, [&](int64_t task) {
+        static thread_local const std::unique_ptr<BackwardTile<S, C>> state(new BackwardTile<S, C>);
+        const int64_t tile = first_tile + task;
+        const int64_t x0 = tile % w.tiles_x() * kTile, y0 = tile / w.tiles_x() * kTile;
+        const int columns = int(std::min<int64_t>(kTile, w.width - x0));
+        const int rows = int(std::min<int64_t>(kTile, w.height - y0));
+        if (columns < kTile || rows < kTile) {
+            std::memset(state->g_image, 0, sizeof state->g_image);
+            std::memset(state->behind, 0, sizeof state->behind);
+        }
+        for (int y = 0; y < rows; ++y) {
+            const int64_t row = (y0 + y) * w.width + x0;
+            for (int x = 0; x < columns; ++x) {
+                const int block = Shape::block(x, y), lane = Shape::lane(x, y);
+                const S* pixel = gradients.g_image + (row + x) * splats.channels + first_channel;
+                for (int c = 0; c < C; ++c) state->g_image[block][c][lane] = pixel[c];
+                // Gradients are linear in those of the image: the slices' sum counts transmittance once.
+                state->behind[block][lane] = first_channel == 0 ? gradients.g_transmittance[row + x] : S(0);
+            }
+        }
+        state->blend(
+            bins, tile, S(w.x0 + x0) + S(0.5), S(w.y0 + y0) + S(0.5),
+            entry_gradients + bins.offset(tile) * gradient_stride(C));
+    });
+}
+
+template <class S>
+int64_t blend_backward(
+    const Splats<S>& splats, const Window& window, const Cutoffs& cutoffs, int threads, const Gradients<S>& gradients) {
+    if (window.width > 65535LL * kTile || window.height > 65535LL * kTile || splats.count > INT32_MAX)
+        return kTooLarge;
+    Bins<S> bins(splats, window, cutoffs, threads);
+    Scratch<S> entry_gradients;
+    int64_t room = 0;
+    int first = 0;
+    do {
+        const int channels = int(std::min<int64_t>(max_channels<S>, splats.channels - first));
+        bins.pack(first, channels);
+        const int64_t stride = gradient_stride(channels);
+        for (int64_t tile = 0; tile < window.tiles();) {
+            const int64_t last = bins.batch_end(tile, kBatchBytes / (stride * int64_t(sizeof(S))));
+            const int64_t needed = bins.entries_between(tile, last) * stride;
+            if (needed > room) entry_gradients.allocate(room = needed);
+            bins.list(tile, last);
+            with_channels<S>(channels, [&](auto c) {
+                blend_tiles<S, c()>(bins, tile, last, threads, splats, first, gradients, entry_gradients.data());
+            });
+            reduce(bins, tile, last, threads, entry_gradients.data(), splats, first, channels, gradients);
+            tile = last;
+        }
+        first += channels;
+    } while (first < splats.channels);
+    return 0;
+}
+
+}  // namespace
+
+// The gradients are added to what is there.
+#define CATACAUSTICS_BLEND_BACKWARD(S, NAME)                                                                           \
+    CATACAUSTICS_EXPORT int64_t NAME(                                                                                  \
+        int64_t count, int64_t channels, const S* means, const S* forms, const S* opacities, const S* features,        \
+        const int64_t* visible, int64_t x0, int64_t y0, int64_t width, int64_t height, double support,                 \
+        double alpha_min, int64_t threads, const S* g_image, const S* g_transmittance, S* g_means, S* g_forms,         \
+        S* g_opacities, S* g_features) {                                                                               \
+        return guarded([&] {                                                                                           \
+            return blend_backward<S>(                                                                                  \
+                {count, channels, means, forms, opacities, features, visible}, {x0, y0, width, height},                \
+                {support, alpha_min}, int(threads),                                                                    \
+                {g_image, g_transmittance, g_means, g_forms, g_opacities, g_features});                                \
+        });                                                                                                            \
+    }
+
+CATACAUSTICS_BLEND_BACKWARD(float, catacaustics_blend_backward_f32)
+CATACAUSTICS_BLEND_BACKWARD(double, catacaustics_blend_backward_f64)
+
+}  // namespace catacaustics

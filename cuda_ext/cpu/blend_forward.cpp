@@ -1,0 +1,137 @@
+#include <cstring>
+#include <memory>
+
+#include "abi.h"
+#include "tile.h"
+
+namespace catacaustics {
+namespace {
+
+// Entries listed at a time, which bounds memory (4 bytes each) where large splats cover many tiles.
+constexpr int64_t kBatchEntries = int64_t(1) << 25;
+
+template <class S, int C>
+struct ForwardTile {
+    using P = Pack<S>;
+    using Shape = TileShape<S>;
+
+    LaneCoordinates<S> at;
+    alignas(64) S image[Shape::blocks][C > 0 ? C : 1][Shape::lanes];
+    alignas(64) S through[Shape::blocks][Shape::lanes];
+    uint8_t blocks[Shape::blocks + 8];
+
+    bool opaque() const {
+        P most(S(0));
+        for (int b = 0; b < Shape::blocks; ++b) most = most + P::load(through[b]);
+        for (int i = 0; i < P::size; ++i)
+            if (most.v[i] != 0) return false;
+        return true;
+    }
+
+    void blend(const Bins<S>& bins, int64_t tile, S tile_x, S tile_y) {
+        std::memset(image, 0, sizeof image);
+        for (auto& block : through) P(S(1)).store(block);
+        const int32_t *first = bins.begin(tile), *end = bins.end(tile);
+        for (const int32_t* entry = first; entry < end; ++entry) {
+            if (entry + 8 < end) {
+                const char* next = reinterpret_cast<const char*>(bins.record(entry[8]));
+                for (int64_t line = 0; line < record_stride(C) * int64_t(sizeof(S)); line += 64)
+                    __builtin_prefetch(next + line);
+            }
+            // Nothing is seen behind pixels whose transmittance is 0, exactly.
+            if (((entry - first) & 63) == 63 && opaque()) return;
+            const S* data = bins.record(*entry);
+            blend_splat(*reinterpret_cast<const Record<S>*>(data), data + kHeader, tile_x, tile_y);
+        }
+    }
+
+    CATACAUSTICS_HD void blend_splat(const Record<S>& record, const S* features, S tile_x, S tile_y) {
+        const TileSplat<S> splat(record, tile_x, tile_y);
+        const int count = list_blocks(at, record, splat.x, splat.y, blocks);
+        P color[C > 0 ? C : 1];
+        for (int c = 0; c < C; ++c) color[c] = P(features[c]);
+        for (int i = 0; i < count; ++i) {
+            const int block = blocks[i];
+            const P falloff = splat.falloff(splat.offset(at, block));
+            P t = P::load(through[block]);
+            const P weight = blend_step(P(splat.opacity), falloff, t);
+            t.store(through[block]);
+            for (int c = 0; c < C; ++c) {
+                S* pixel = image[block][c];
+                (P::load(pixel) + weight * color[c]).store(pixel);
+            }
+        }
+    }
+};
+
+template <class S>
+struct Target {
+    S *image, *transmittance;
+    int channels, first;  // channels of the image; the first that this slice computes
+};
+
+template <class S, int C>
+void blend_tiles(Bins<S>& bins, int64_t first_tile, int64_t last_tile, int threads, const Target<S>& target) {
+    using Shape = TileShape<S>;
+    const Window& w = bins.window;
+    parallel_for(threads, last_tile - first_tile, [&](int64_t task) {
+        static thread_local const std::unique_ptr<ForwardTile<S, C>> state(new ForwardTile<S, C>);
+        const int64_t tile = first_tile + task;
+        const int64_t x0 = tile % w.tiles_x() * kTile, y0 = tile / w.tiles_x() * kTile;
+        state->blend(bins, tile, S(w.x0 + x0) + S(0.5), S(w.y0 + y0) + S(0.5));
+        const int columns = int(std::min<int64_t>(kTile, w.width - x0));
+        const int rows = int(std::min<int64_t>(kTile, w.height - y0));
+        for (int y = 0; y < rows; ++y) {
+            const int64_t row = (y0 + y) * w.width + x0;
+            for (int x = 0; x < columns; ++x) {
+                const int block = Shape::block(x, y), lane = Shape::lane(x, y);
+                S* pixel = target.image + (row + x) * target.channels + target.first;
+                for (int c = 0; c < C; ++c) pixel[c] = state->image[block][c][lane];
+                if (target.first == 0) target.transmittance[row + x] = state->through[block][lane];
+            }
+        }
+    });
+}
+
+template <class S>
+int64_t blend(
+    const Splats<S>& splats, const Window& window, const Cutoffs& cutoffs, int threads, S* image, S* transmittance) {
+    if (window.width > 65535LL * kTile || window.height > 65535LL * kTile || splats.count > INT32_MAX)
+        return kTooLarge;
+    Bins<S> bins(splats, window, cutoffs, threads);
+    const int slice = max_channels<S>;
+    int first = 0;
+    do {  // at least once: without channels there is still transmittance
+        const int channels = int(std::min<int64_t>(slice, splats.channels - first));
+        bins.pack(first, channels);
+        for (int64_t tile = 0; tile < window.tiles();) {
+            const int64_t last = bins.batch_end(tile, kBatchEntries);
+            bins.list(tile, last);
+            with_channels<S>(channels, [&](auto c) {
+                blend_tiles<S, c()>(bins, tile, last, threads, {image, transmittance, int(splats.channels), first});
+            });
+            tile = last;
+        }
+        first += channels;
+    } while (first < splats.channels);
+    return 0;
+}
+
+}  // namespace
+
+#define CATACAUSTICS_BLEND_FORWARD(S, NAME)                                                                            \
+    CATACAUSTICS_EXPORT int64_t NAME(                                                                                  \
+        int64_t count, int64_t channels, const S* means, const S* forms, const S* opacities, const S* features,        \
+        const int64_t* visible, int64_t x0, int64_t y0, int64_t width, int64_t height, double support,                 \
+        double alpha_min, int64_t threads, S* image, S* transmittance) {                                               \
+        return guarded([&] {                                                                                           \
+            return blend<S>(                                                                                           \
+                {count, channels, means, forms, opacities, features, visible}, {x0, y0, width, height},                \
+                {support, alpha_min}, int(threads), image, transmittance);                                             \
+        });                                                                                                            \
+    }
+
+CATACAUSTICS_BLEND_FORWARD(float, catacaustics_blend_f32)
+CATACAUSTICS_BLEND_FORWARD(double, catacaustics_blend_f64)
+
+}  // namespace catacaustics

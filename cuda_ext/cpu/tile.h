@@ -1,0 +1,133 @@
+// What the forward and the backward pass over a tile share.
+#pragma once
+
+#include <algorithm>
+#include <cmath>
+
+#include "bins.h"
+
+namespace catacaustics {
+
+template <class S>
+struct TileShape {
+    static constexpr int lanes = Pack<S>::size;
+    static constexpr int block_width = 4, block_height = lanes / block_width;
+    static constexpr int block_columns = kTile / block_width, block_rows = kTile / block_height;
+    static constexpr int blocks = block_columns * block_rows;
+    static_assert(block_columns == 8 && blocks <= 256, "block numbers fit a byte");
+
+    // Where pixel (x, y) of a tile is kept: its block, and its lane in the block.
+    static int block(int x, int y) { return y / block_height * block_columns + x / block_width; }
+    static int lane(int x, int y) { return y % block_height * block_width + x % block_width; }
+};
+
+// Pixel coordinates within the tile, pack by pack.
+template <class S>
+struct LaneCoordinates {
+    using Shape = TileShape<S>;
+    alignas(64) S x[Shape::block_columns][Shape::lanes];
+    alignas(64) S y[Shape::block_rows][Shape::lanes];
+    alignas(64) S row[Shape::lanes];  // first pixel row of block row i
+
+    LaneCoordinates() {
+        for (int i = 0; i < Shape::lanes; ++i) row[i] = S(i * Shape::block_height);
+        for (int py = 0; py < kTile; ++py)
+            for (int px = 0; px < kTile; ++px) {
+                x[px / Shape::block_width][Shape::lane(px, py)] = S(px);
+                y[py / Shape::block_height][Shape::lane(px, py)] = S(py);
+            }
+    }
+};
+
+// A splat seen from a tile: constants of the pair loop.
+template <class S>
+struct TileSplat {
+    S x, y;  // first pixel centre of the tile minus the mean
+    S m, opacity, scaled_w, scaled_v;
+    S floor;  // least exponent drawn
+
+    TileSplat(const Record<S>& r, S tile_x, S tile_y)
+        : x(tile_x - r.mean_x),
+          y(tile_y - r.mean_y),
+          m(r.m),
+          opacity(r.opacity),
+          scaled_w(r.scaled_w),
+          scaled_v(r.scaled_v),
+          floor(std::max(r.reach2 * S(kExponentScale), kLowestExponent<S>)) {}
+
+    struct Offset {
+        Pack<S> skew, dy;
+    };
+    CATACAUSTICS_HD Offset offset(const LaneCoordinates<S>& at, int block) const {
+        using P = Pack<S>;
+        const P dy = P::load(at.y[block >> 3]) + P(y);
+        return {(P::load(at.x[block & 7]) + P(x)) - P(m) * dy, dy};
+    }
+    CATACAUSTICS_HD Pack<S> falloff(const Offset& d) const {
+        return exp2_or_zero(exponent(d.skew, d.dy, Pack<S>(scaled_w), Pack<S>(scaled_v)), floor);
+    }
+};
+
+// Writes the numbers of the blocks a splat can touch; returns how many. `numbers` has room for blocks + 8.
+template <class S>
+CATACAUSTICS_HD int list_blocks(const LaneCoordinates<S>& at, const Record<S>& r, S x, S y, uint8_t* numbers) {
+    using P = Pack<S>;
+    using Shape = TileShape<S>;
+    using Integer = typename Bits<S>::type;
+    const S v = r.v(), inv_w = S(kExponentScale) / r.scaled_w;
+    const S reach_y = std::sqrt(r.reach2 / v);
+    const S room = S(0.01) + S(4e-7) * std::abs(y);
+    const S top = -reach_y - y - room, bottom = reach_y - y + room;
+    const int first = !(top > S(0)) ? 0 : int(std::min(top, S(kTile))) / Shape::block_height;
+    const int last = !(bottom < S(kTile - 1)) ? Shape::block_rows - 1
+                     : bottom < S(0)          ? -1
+                                              : int(bottom) / Shape::block_height;
+    const P room_x(S(0.01) + S(4e-7) * std::abs(x));
+    int count = 0;
+    alignas(64) Integer begin[P::size], length[P::size];
+    for (int row = first; row <= last; row += P::size) {
+        const P low = P::load(at.row) + P(y + S(row * Shape::block_height));
+        P left, right;
+        row_extent(
+            low, low + P(S(Shape::block_height - 1)), P(reach_y), P(r.turn), P(r.reach2), P(r.m), P(v), P(inv_w), left,
+            right);
+        // Blocks from the one of the first pixel centre not left of `left`, to that of the last not right of `right`.
+        left = left - P(x) - room_x;
+        right = right - P(x) + room_x;
+        left = select(left > P(S(0)), left, P(S(0)));
+        left = select(left < P(S(kTile)), left, P(S(kTile)));
+        right = select(right < P(S(kTile - 1)), right, P(S(kTile - 1)));
+        right = select(right > P(S(-1)), right, P(S(-1)));
+        using Mask = typename P::Mask;
+        const Mask from = (kTile - __builtin_convertvector((P(S(kTile)) - left).v, Mask)) >> 2;
+        const Mask to = (__builtin_convertvector((right + P(S(1))).v, Mask) - 1) >> 2;
+        const Mask number = to - from + 1;
+        *reinterpret_cast<Mask*>(begin) = from;
+        *reinterpret_cast<Mask*>(length) = number > 0 ? number : Mask{};
+        const int here = std::min(P::size, last - row + 1);
+        for (int i = 0; i < here; ++i) {
+            const uint64_t block = uint64_t((row + i) * Shape::block_columns + begin[i]);
+            const uint64_t run = block * 0x0101010101010101ull + 0x0706050403020100ull;
+            std::memcpy(numbers + count, &run, 8);
+            count += int(length[i]);
+        }
+    }
+    return count;
+}
+
+// Kernels are compiled for every number of channels up to this, and more channels are done in slices.
+template <class S>
+constexpr int max_channels = sizeof(S) == 4 ? 16 : 4;
+
+// Calls function(std::integral_constant<int, channels>()).
+template <class S, int C = 0, class F>
+void with_channels(int channels, F&& function) {
+    if constexpr (C <= max_channels<S>) {
+        if (channels == C)
+            function(std::integral_constant<int, C>());
+        else
+            with_channels<S, C + 1>(channels, function);
+    }
+}
+
+}  // namespace catacaustics

@@ -1,0 +1,184 @@
+// Projection of an oriented disk (see catacaustics/splatting/reference.py for the equations) and its derivative.
+#pragma once
+
+#include "common.h"
+
+namespace catacaustics {
+
+template <class T>
+struct Vec3 {
+    T x, y, z;
+};
+
+template <class T>
+CATACAUSTICS_HD Vec3<T> operator+(Vec3<T> a, Vec3<T> b) {
+    return {a.x + b.x, a.y + b.y, a.z + b.z};
+}
+
+template <class T>
+CATACAUSTICS_HD T dot(Vec3<T> a, Vec3<T> b) {
+    return a.x * b.x + a.y * b.y + a.z * b.z;
+}
+
+// camera_from_world as three rows and a translation, and the lens in pixels.
+template <class T>
+struct View {
+    Vec3<T> row[3];
+    Vec3<T> translation;
+    T fx, fy, cx, cy;
+};
+
+template <class T>
+CATACAUSTICS_HD Vec3<T> rotate(const View<T>& view, Vec3<T> a) {
+    return {dot(view.row[0], a), dot(view.row[1], a), dot(view.row[2], a)};
+}
+
+template <class T>
+CATACAUSTICS_HD Vec3<T> rotate_back(const View<T>& view, Vec3<T> a) {
+    return {
+        view.row[0].x * a.x + view.row[1].x * a.y + view.row[2].x * a.z,
+        view.row[0].y * a.x + view.row[1].y * a.y + view.row[2].y * a.z,
+        view.row[0].z * a.x + view.row[1].z * a.y + view.row[2].z * a.z,
+    };
+}
+
+// Mean in pixels; quadratic form w (dx - m dy)^2 + v dy^2; variances along x and y; depth.
+template <class T>
+struct ScreenSplat {
+    T mean_x, mean_y;
+    T w, m, v;
+    T variance_x, variance_y;
+    T depth;
+};
+
+// What the forward and the backward pass both need.
+template <class T>
+struct Projection {
+    Vec3<T> camera, normal;         // in the camera's frame
+    T inv_z, u, v, kx, ky;          // u = x/z, v = y/z, kx = fx/z, ky = fy/z
+    T sign, a, b;                   // of the tangent basis (Duff et al. 2017)
+    T d11, d12, d21, d22;           // J = [[kx d11, kx d12], [ky d21, ky d22]]
+    T j11, j12, j21, j22;
+    T jj11, jj22, jj12;             // J J^T
+    T facing, det_j;                // facing = n . (u, v, 1)
+    T sdet, det, s22, w, m, inv_s22;  // sdet = s det J; det, s22 of Sigma
+    T s11;
+};
+
+template <class T>
+CATACAUSTICS_HD Projection<T> project_disk(const View<T>& view, Vec3<T> position, Vec3<T> normal, T s, T low_pass) {
+    Projection<T> r;
+    r.camera = rotate(view, position) + view.translation;
+    r.normal = rotate(view, normal);
+    const Vec3<T> n = r.normal;
+    r.inv_z = T(1) / r.camera.z;
+    r.u = r.camera.x * r.inv_z;
+    r.v = r.camera.y * r.inv_z;
+    r.kx = view.fx * r.inv_z;
+    r.ky = view.fy * r.inv_z;
+    // Tangents t1 = (1 + sign x^2 a, sign b, -sign x) and t2 = (b, sign + y^2 a, -y).
+    r.sign = select(n.z < T(0), T(-1), T(1));
+    r.a = T(-1) / (r.sign + n.z);
+    r.b = n.x * n.y * r.a;
+    const Vec3<T> t1{T(1) + r.sign * n.x * n.x * r.a, r.sign * r.b, -(r.sign * n.x)};
+    const Vec3<T> t2{r.b, r.sign + n.y * n.y * r.a, -n.y};
+    r.d11 = t1.x - r.u * t1.z;
+    r.d21 = t1.y - r.v * t1.z;
+    r.d12 = t2.x - r.u * t2.z;
+    r.d22 = t2.y - r.v * t2.z;
+    r.j11 = r.kx * r.d11;
+    r.j12 = r.kx * r.d12;
+    r.j21 = r.ky * r.d21;
+    r.j22 = r.ky * r.d22;
+    r.jj11 = r.j11 * r.j11 + r.j12 * r.j12;
+    r.jj22 = r.j21 * r.j21 + r.j22 * r.j22;
+    r.jj12 = r.j11 * r.j21 + r.j12 * r.j22;
+    r.facing = n.x * r.u + n.y * r.v + n.z;
+    r.det_j = r.kx * r.ky * r.facing;
+    const T s11 = s * r.jj11, s22 = s * r.jj22;
+    r.sdet = s * r.det_j;
+    r.det = r.sdet * r.sdet + low_pass * (s11 + s22) + low_pass * low_pass;
+    r.s11 = s11 + low_pass;
+    r.s22 = s22 + low_pass;
+    r.w = r.s22 / r.det;
+    r.inv_s22 = T(1) / r.s22;
+    r.m = s * r.jj12 * r.inv_s22;
+    return r;
+}
+
+template <class T>
+CATACAUSTICS_HD ScreenSplat<T> screen_splat(const View<T>& view, const Projection<T>& r) {
+    return {view.fx * r.u + view.cx, view.fy * r.v + view.cy, r.w, r.m, r.inv_s22, r.s11, r.s22, r.camera.z};
+}
+
+template <class T>
+struct ScreenGradient {
+    T mean_x, mean_y, w, m, v;
+};
+
+// Gradients in world space, and what the disk adds to those of the pose and the lens.
+template <class T>
+struct DiskGradient {
+    Vec3<T> position, normal;
+    T footprint;
+    Vec3<T> row[3];
+    Vec3<T> translation;
+    T fx, fy, cx, cy;
+};
+
+template <class T>
+CATACAUSTICS_HD DiskGradient<T> project_disk_backward(
+    const View<T>& view, Vec3<T> position, Vec3<T> normal, T s, T low_pass, const Projection<T>& r,
+    const ScreenGradient<T>& g) {
+    const Vec3<T> n = r.normal;
+    // Sigma.
+    const T g_det = -g.w * r.w / r.det;
+    const T g_s11 = low_pass * g_det;
+    const T g_s22 = g.w / r.det - (g.m * r.m + g.v * r.inv_s22) * r.inv_s22 + low_pass * g_det;
+    const T g_s12 = g.m * r.inv_s22;
+    const T g_sdet = T(2) * r.sdet * g_det;
+    DiskGradient<T> out;
+    out.footprint = r.jj11 * g_s11 + r.jj22 * g_s22 + r.jj12 * g_s12 + r.det_j * g_sdet;
+    // J J^T and det J.
+    const T g_jj11 = T(2) * s * g_s11, g_jj22 = T(2) * s * g_s22, g_jj12 = s * g_s12, g_det_j = s * g_sdet;
+    const T g_j11 = r.j11 * g_jj11 + r.j21 * g_jj12;
+    const T g_j12 = r.j12 * g_jj11 + r.j22 * g_jj12;
+    const T g_j21 = r.j21 * g_jj22 + r.j11 * g_jj12;
+    const T g_j22 = r.j22 * g_jj22 + r.j12 * g_jj12;
+    const T g_facing = r.kx * r.ky * g_det_j;
+    const T g_kx = r.ky * r.facing * g_det_j + r.d11 * g_j11 + r.d12 * g_j12;
+    const T g_ky = r.kx * r.facing * g_det_j + r.d21 * g_j21 + r.d22 * g_j22;
+    const T g_d11 = r.kx * g_j11, g_d12 = r.kx * g_j12, g_d21 = r.ky * g_j21, g_d22 = r.ky * g_j22;
+    // Tangents.
+    const T t1z = -(r.sign * n.x), t2z = -n.y;
+    const T g_t1z = -(r.u * g_d11 + r.v * g_d21), g_t2z = -(r.u * g_d12 + r.v * g_d22);
+    const T g_u = n.x * g_facing - t1z * g_d11 - t2z * g_d12 + view.fx * g.mean_x;
+    const T g_v = n.y * g_facing - t1z * g_d21 - t2z * g_d22 + view.fy * g.mean_y;
+    const T g_b = r.sign * g_d21 + g_d12;
+    const T g_a = r.sign * n.x * n.x * g_d11 + n.y * n.y * g_d22 + n.x * n.y * g_b;
+    const Vec3<T> g_n{
+        r.u * g_facing + T(2) * r.sign * n.x * r.a * g_d11 - r.sign * g_t1z + n.y * r.a * g_b,
+        r.v * g_facing + T(2) * n.y * r.a * g_d22 - g_t2z + n.x * r.a * g_b,
+        g_facing + r.a * r.a * g_a,
+    };
+    // Perspective division.
+    const T g_inv_z = view.fx * g_kx + view.fy * g_ky + r.camera.x * g_u + r.camera.y * g_v;
+    const Vec3<T> g_camera{r.inv_z * g_u, r.inv_z * g_v, -(r.inv_z * r.inv_z * g_inv_z)};
+    out.position = rotate_back(view, g_camera);
+    out.normal = rotate_back(view, g_n);
+    const T camera[3] = {g_camera.x, g_camera.y, g_camera.z}, turned[3] = {g_n.x, g_n.y, g_n.z};
+    for (int i = 0; i < 3; ++i)
+        out.row[i] = {
+            camera[i] * position.x + turned[i] * normal.x,
+            camera[i] * position.y + turned[i] * normal.y,
+            camera[i] * position.z + turned[i] * normal.z,
+        };
+    out.translation = g_camera;
+    out.fx = r.inv_z * g_kx + r.u * g.mean_x;
+    out.fy = r.inv_z * g_ky + r.v * g.mean_y;
+    out.cx = g.mean_x;
+    out.cy = g.mean_y;
+    return out;
+}
+
+}  // namespace catacaustics
