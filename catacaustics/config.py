@@ -97,7 +97,7 @@ class TrainConfig:
     lr_normal: float = 1e-3
     lr_footprint: float = 5e-3
     lr_opacity: float = 5e-2
-    lr_features: float = 5e-3
+    lr_features: float = 1e-2
     lr_network: float = 1e-3
     lr_network_final: float = 1e-4
     warp_weight_decay: float = 1e-2

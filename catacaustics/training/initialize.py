@@ -15,7 +15,7 @@ from catacaustics.renderer import FEATURES, NeuralRenderer
 from catacaustics.scene import PointParameters, Scene
 from catacaustics.shapes import Float
 
-INITIAL_OPACITY = 0.5
+INITIAL_OPACITY = 0.8
 _SURFACE_SHARE = 0.3
 """Primary points on the reflectors' surfaces are at most this share of the cloud."""
 
