@@ -98,6 +98,8 @@ class TrainConfig:
     lr_footprint: float = 5e-3
     lr_opacity: float = 5e-2
     lr_features: float = 1e-2
+    lr_final_share: float = 0.1
+    """Rates of normals, footprints, opacities and features decay to this share of their start."""
     lr_network: float = 1e-3
     lr_network_final: float = 1e-4
     warp_weight_decay: float = 1e-2

@@ -20,13 +20,16 @@ def _rate(name: str, config: TrainConfig, extent: float, progress: float, warm_u
         return decay(config.lr_network, config.lr_network_final)
     if kind == "positions":
         return 0.0 if warm_up else extent * decay(config.lr_position, config.lr_position_final)
-    if kind == "normals":
-        return 0.0 if warm_up else config.lr_normal
-    if kind == "log_footprints":
-        return config.lr_footprint
-    if kind in ("opacity_logits", "rho_logits"):
-        return config.lr_opacity
-    return config.lr_features
+    if kind == "normals" and warm_up:
+        return 0.0
+    start = {
+        "normals": config.lr_normal,
+        "log_footprints": config.lr_footprint,
+        "opacity_logits": config.lr_opacity,
+        "rho_logits": config.lr_opacity,
+        "features": config.lr_features,
+    }[kind]
+    return decay(start, start * config.lr_final_share)
 
 
 def make_optimizer(scene: Scene, config: TrainConfig) -> torch.optim.AdamW:
