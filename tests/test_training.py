@@ -16,7 +16,13 @@ from catacaustics.errors import UserError
 from catacaustics.scene import Scene
 from catacaustics.training import loop
 from catacaustics.training.densification import GradientStatistics, densify
-from catacaustics.training.initialize import Seeds, grow_cloud, neighbor_footprints, start_cloud
+from catacaustics.training.initialize import (
+    INITIAL_OPACITY,
+    Seeds,
+    grow_cloud,
+    neighbor_footprints,
+    start_cloud,
+)
 from catacaustics.training.optimizer import make_optimizer
 
 
@@ -148,7 +154,8 @@ def test_a_new_point_takes_what_its_nearest_point_has_learned():
     nearest = np.argmin(np.linalg.norm(positions[10:, None] - positions[None, :10], axis=-1), axis=1)
     for new, old in enumerate(nearest, 10):
         assert grown.features[new, 5].item() == (7.0 if old == 4 else 0.0)
-        assert grown.opacity_logits[new].item() == pytest.approx(2.0 if old == 4 else 0.0, abs=1e-6)
+        gained = grown.opacity_logits[new].item() - np.log(INITIAL_OPACITY / (1 - INITIAL_OPACITY))
+        assert gained == pytest.approx(2.0 if old == 4 else 0.0, abs=1e-6)
         np.testing.assert_allclose(grown.features.detach()[new, :3], seeds.colors[new], rtol=1e-6)
 
 
