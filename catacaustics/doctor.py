@@ -47,6 +47,7 @@ def _splat_self_test(backend: str) -> str:
     normals = torch.tensor([0.0, 0.0, -1.0]).expand(2000, 3)
     camera = Camera(160, 120, 120.0, 120.0, 80.0, 60.0, np.eye(4))
     values = torch.full((2000,), 1e-4), torch.full((2000,), 0.5), torch.ones(2000, 3)
+    splat_points(positions, normals, *values, camera, backend=backend).image.sum().backward()  # warm up
     start = time.perf_counter()
     output = splat_points(positions, normals, *values, camera, backend=backend)
     output.image.sum().backward()

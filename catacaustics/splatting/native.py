@@ -16,7 +16,6 @@ import functools
 import struct
 import sys
 import sysconfig
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -152,10 +151,9 @@ def _folders() -> list[Path]:
 @functools.cache
 def find_library() -> _Found:
     """The best library for this processor, or why there is none. Looked for once."""
-    suffix = "dylib" if sys.platform == "darwin" else "so"
     problems = []
     for folder in _folders():
-        for path in (folder / f"lib{name}.{suffix}" for name in _NAMES):
+        for path in (folder / f"lib{name}.so" for name in _NAMES):
             if path.is_file():
                 try:
                     return _Found(load_library(path), "")
@@ -179,19 +177,25 @@ def splat_project(
     opacities: Tensor,
     pose: Tensor,
     lens: Tensor,
-    viewport: Sequence[int],
+    x0: int,
+    y0: int,
+    width: int,
+    height: int,
     low_pass: float,
     support: float,
     alpha_min: float,
     near: float,
-    guard: Sequence[float],
+    left: float,
+    top: float,
+    right: float,
+    bottom: float,
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Project the points that can touch a viewport; differentiable in all tensors but `opacities`, which only cull.
 
     Args:
         pose: camera_from_world (4, 4). lens: (4,) = fx, fy, cx, cy.
-        viewport: x0, y0, width, height.
-        guard: left, top, right, bottom in pixels; points whose mean is not between them are dropped.
+        x0, y0, width, height: the viewport.
+        left, top, right, bottom: in pixels; points whose mean is not between them are dropped.
 
     Returns:
         means (m, 2), forms (m, 3) and indices (m,) of visible points, near to far, points at equal depth in order.
@@ -203,15 +207,16 @@ def splat_project(
     n = len(positions)
     means, forms = positions.new_empty(n, 2), positions.new_empty(n, 3)
     visible = torch.empty(n, dtype=torch.int64)
+    window, guard = (x0, y0, width, height), (left, top, right, bottom)
     cuts = (low_pass, support, alpha_min, near, *guard, torch.get_num_threads())
-    count = _library().call("project", positions.dtype, n, *inputs, *viewport, *cuts, means, forms, visible)
+    count = _library().call("project", positions.dtype, n, *inputs, *window, *cuts, means, forms, visible)
     if count == _INVALID_VALUES:
         check_values(positions=positions, normals=normals, footprints=footprints, opacities=opacities)
     return means[:count], forms[:count], visible[:count]
 
 
 @splat_project.register_fake
-def _(positions, normals, footprints, opacities, pose, lens, viewport, low_pass, support, alpha_min, near, guard):
+def _(positions, *_):
     count = torch.library.get_ctx().new_dynamic_size()
     return (
         positions.new_empty(count, 2),
@@ -248,13 +253,14 @@ def _(g_means, g_forms, positions, normals, footprints, pose, lens, visible, low
 
 
 def _save_project(ctx, inputs, output):
-    positions, normals, footprints, _, pose, lens, _, ctx.low_pass, *_ = inputs
+    positions, normals, footprints, _, pose, lens, *_ = inputs
+    ctx.low_pass = inputs[10]
     ctx.save_for_backward(positions, normals, footprints, pose, lens, output[2])
 
 
 def _project_gradients(ctx, g_means, g_forms, _):
     g = splat_project_backward(g_means, g_forms, *ctx.saved_tensors, ctx.low_pass)
-    return *g[:3], None, *g[3:], *[None] * 6
+    return *g[:3], None, *g[3:], *[None] * 12
 
 
 splat_project.register_autograd(_project_gradients, setup_context=_save_project)
@@ -267,7 +273,10 @@ def splat_blend(
     opacities: Tensor,
     features: Tensor,
     visible: Tensor,
-    viewport: Sequence[int],
+    x0: int,
+    y0: int,
+    width: int,
+    height: int,
     support: float,
     alpha_min: float,
 ) -> tuple[Tensor, Tensor]:
@@ -280,17 +289,15 @@ def splat_blend(
     Returns:
         image (height, width, channels) and transmittance (height, width).
     """
-    _, _, width, height = viewport
     inputs = [t.contiguous() for t in (means, forms, opacities, features, visible)]
     image, transmittance = means.new_empty(height, width, features.shape[1]), means.new_empty(height, width)
     sizes, cuts = (len(means), features.shape[1]), (support, alpha_min, torch.get_num_threads())
-    _library().call("blend", means.dtype, *sizes, *inputs, *viewport, *cuts, image, transmittance)
+    _library().call("blend", means.dtype, *sizes, *inputs, x0, y0, width, height, *cuts, image, transmittance)
     return image, transmittance
 
 
 @splat_blend.register_fake
-def _(means, forms, opacities, features, visible, viewport, support, alpha_min):
-    _, _, width, height = viewport
+def _(means, forms, opacities, features, visible, x0, y0, width, height, support, alpha_min):
     return means.new_empty(height, width, features.shape[1]), means.new_empty(height, width)
 
 
@@ -303,7 +310,10 @@ def splat_blend_backward(
     opacities: Tensor,
     features: Tensor,
     visible: Tensor,
-    viewport: Sequence[int],
+    x0: int,
+    y0: int,
+    width: int,
+    height: int,
     support: float,
     alpha_min: float,
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -312,23 +322,23 @@ def splat_blend_backward(
     g_inputs = [torch.zeros_like(t) for t in inputs[:4]]
     g_outputs = (g_image.contiguous(), g_transmittance.contiguous())
     sizes, cuts = (len(means), features.shape[1]), (support, alpha_min, torch.get_num_threads())
-    _library().call("blend_backward", means.dtype, *sizes, *inputs, *viewport, *cuts, *g_outputs, *g_inputs)
+    window = (x0, y0, width, height)
+    _library().call("blend_backward", means.dtype, *sizes, *inputs, *window, *cuts, *g_outputs, *g_inputs)
     return tuple(g_inputs)
 
 
 @splat_blend_backward.register_fake
-def _(g_image, g_transmittance, means, forms, opacities, features, visible, viewport, support, alpha_min):
+def _(g_image, g_transmittance, means, forms, opacities, features, *_):
     return tuple(t.new_empty(t.shape) for t in (means, forms, opacities, features))
 
 
 def _save_blend(ctx, inputs, output):
-    *tensors, ctx.viewport, ctx.support, ctx.alpha_min = inputs
-    ctx.save_for_backward(*tensors)
+    ctx.save_for_backward(*inputs[:5])
+    ctx.settings = inputs[5:]
 
 
 def _blend_gradients(ctx, g_image, g_transmittance):
-    g = splat_blend_backward(g_image, g_transmittance, *ctx.saved_tensors, ctx.viewport, ctx.support, ctx.alpha_min)
-    return *g, None, None, None, None
+    return *splat_blend_backward(g_image, g_transmittance, *ctx.saved_tensors, *ctx.settings), *[None] * 7
 
 
 splat_blend.register_autograd(_blend_gradients, setup_context=_save_blend)
@@ -354,10 +364,9 @@ def splat_points(
     pose = torch.tensor(camera.camera_from_world, dtype=positions.dtype)
     lens = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=positions.dtype)
     band, width, height = config.guard_band, camera.width, camera.height
-    guard = [-band * width, -band * height, (1 + band) * width, (1 + band) * height]
-    cuts = (config.low_pass, config.support, config.alpha_min, config.near, guard)
-    window = list(viewport)
-    means, forms, visible = splat_project(positions, normals, footprints, opacities, pose, lens, window, *cuts)
+    guard = (-band * width, -band * height, (1 + band) * width, (1 + band) * height)
+    cuts = (config.low_pass, config.support, config.alpha_min, config.near, *guard)
+    means, forms, visible = splat_project(positions, normals, footprints, opacities, pose, lens, *viewport, *cuts)
     blend_cuts = (config.support, config.alpha_min)
-    image, transmittance = splat_blend(means, forms, opacities, features, visible, window, *blend_cuts)
+    image, transmittance = splat_blend(means, forms, opacities, features, visible, *viewport, *blend_cuts)
     return SplatOutput(image, transmittance, visible, means)

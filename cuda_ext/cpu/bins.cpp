@@ -13,14 +13,6 @@ S margin(S coordinate) {
     return S(0.01) + S(4e-7) * std::abs(coordinate);
 }
 
-template <class S>
-Record<S> make_record(const S* mean, const S* form, S opacity, const Cutoffs& cutoffs) {
-    const S w = form[0] > S(1e-30) ? form[0] : S(1e-30), m = form[1], v = form[2];
-    const S reach2 = cutoffs.reach2(opacity);
-    const S turn = std::sqrt(reach2) * m / (v * std::sqrt(S(1) / w + m * m / v));
-    return {mean[0], mean[1], m, opacity, w * S(kExponentScale), v * S(kExponentScale), reach2, turn};
-}
-
 // Pixels [first, last] of `size` whose centres lie in [low, high], relative to the first pixel's centre.
 template <class S>
 void clip(S low, S high, int64_t size, int64_t& first, int64_t& last) {
@@ -30,17 +22,53 @@ void clip(S low, S high, int64_t size, int64_t& first, int64_t& last) {
 
 }  // namespace
 
+// Headers and tiles of the splats [begin, begin + lanes) that are before `end`, all lanes at once.
 template <class S>
-TileRange Bins<S>::range(const Record<S>& r) const {
-    const S w = r.w(), v = r.v();
-    const S x = r.mean_x - (S(window.x0) + S(0.5)), y = r.mean_y - (S(window.y0) + S(0.5));
-    const S reach_x = std::sqrt(r.reach2 * (S(1) / w + r.m * r.m / v)) + margin(r.mean_x);
-    const S reach_y = std::sqrt(r.reach2 / v) + margin(r.mean_y);
-    int64_t x0, x1, y0, y1;
-    clip(x - reach_x, x + reach_x, window.width, x0, x1);
-    clip(y - reach_y, y + reach_y, window.height, y0, y1);
-    if (x1 < x0 || y1 < y0 || !(r.reach2 > S(0))) return {1, 0, 1, 0};
-    return {uint16_t(x0 / kTile), uint16_t(x1 / kTile), uint16_t(y0 / kTile), uint16_t(y1 / kTile)};
+void Bins<S>::make_headers(int64_t begin, int64_t end) {
+    using P = Pack<S>;
+    constexpr int lanes = P::size;
+    const int here = int(std::min<int64_t>(lanes, end - begin));
+    alignas(64) S in[7][lanes], out[8][lanes];
+    for (int lane = 0; lane < lanes; ++lane) {
+        const int64_t i = begin + std::min(lane, here - 1);
+        for (int k = 0; k < 2; ++k) in[k][lane] = splats_.means[2 * i + k];
+        for (int k = 0; k < 3; ++k) in[2 + k][lane] = splats_.forms[3 * i + k];
+        in[5][lane] = splats_.opacities[splats_.visible[i]];
+        in[6][lane] = cutoffs_.reach2(in[5][lane]);
+    }
+    const P zero(S(0)), tiny(S(1e-30));
+    const P mean_x = P::load(in[0]), mean_y = P::load(in[1]), m = P::load(in[3]), v = P::load(in[4]);
+    const P w = select(P::load(in[2]) > tiny, P::load(in[2]), tiny), reach2 = P::load(in[6]);
+    const P variance_x = P(S(1)) / w + m * m / v;
+    const P reach_x = square_root(reach2 * variance_x), reach_y = square_root(reach2 / v);
+    const P turn = reach2 * m / (v * select(reach_x > tiny, reach_x, tiny));
+    const P scaled_w = w * P(S(kExponentScale)), scaled_v = v * P(S(kExponentScale));
+    // Pixels whose centres lie within the reach, clamped so that they fit an integer; not-a-numbers give all pixels.
+    const auto clip = [&](P mean, P reach, int64_t start, int64_t size, S* first, S* last) {
+        const P margin = P(S(0.01)) + P(S(4e-7)) * select(mean < zero, -mean, mean);
+        const P middle = mean - P(S(start) + S(0.5)), most = P(S(size - 1)), outside = P(S(size));
+        P low = middle - reach - margin, high = middle + reach + margin;
+        low = select(low > zero, low, zero);
+        select(low < outside, low, outside).store(first);
+        high = select(high < most, high, most);
+        select(high > P(S(-1)), high, P(S(-1))).store(last);
+    };
+    clip(mean_x, reach_x, window.x0, window.width, out[0], out[1]);
+    clip(mean_y, reach_y, window.y0, window.height, out[2], out[3]);
+    turn.store(out[4]);
+    scaled_w.store(out[5]);
+    scaled_v.store(out[6]);
+    for (int lane = 0; lane < here; ++lane) {
+        headers_[begin + lane] = {in[0][lane],  in[1][lane],  in[3][lane], in[5][lane],
+                                  out[5][lane], out[6][lane], in[6][lane], out[4][lane]};
+        // Rounding to the tile of the pixel before is harmless.
+        const bool none = out[1][lane] < S(0) || out[3][lane] < S(0) || out[0][lane] >= S(window.width) ||
+                          out[2][lane] >= S(window.height) || !(in[6][lane] > S(0));
+        ranges_[begin + lane] = none ? TileRange{1, 0, 1, 0}
+                                     : TileRange{
+                                           uint16_t(int(out[0][lane]) / kTile), uint16_t(int(out[1][lane]) / kTile),
+                                           uint16_t(int(out[2][lane]) / kTile), uint16_t(int(out[3][lane]) / kTile)};
+    }
 }
 
 template <class S>
@@ -81,12 +109,12 @@ Bins<S>::Bins(const Splats<S>& splats, const Window& window, const Cutoffs& cuto
     parallel_for(threads_, parts_, [&](int64_t part) {
         int32_t* counts = counts_.data() + part * tiles;
         const int64_t end = part_begin(part + 1);
-        for (int64_t i = part_begin(part); i < end; ++i) {
-            if (i + 16 < end) __builtin_prefetch(splats_.opacities + splats_.visible[i + 16]);
-            headers_[i] = make_record(
-                splats_.means + 2 * i, splats_.forms + 3 * i, splats_.opacities[splats_.visible[i]], cutoffs_);
-            ranges_[i] = range(headers_[i]);
-            each_tile(i, [&](int64_t tile) { ++counts[tile]; });
+        for (int64_t begin = part_begin(part); begin < end; begin += Pack<S>::size) {
+            make_headers(begin, end);
+            for (int64_t i = begin; i < std::min(end, begin + Pack<S>::size); ++i) {
+                if (i + 64 < end) __builtin_prefetch(splats_.opacities + splats_.visible[i + 64]);
+                each_tile(i, [&](int64_t tile) { ++counts[tile]; });
+            }
         }
     });
     starts_.resize(tiles + 1);

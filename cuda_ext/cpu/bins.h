@@ -89,7 +89,7 @@ class Bins {
     template <class F>
     void each_tile(int64_t splat, F&& function) const;
     int64_t part_begin(int64_t part) const { return splats_.count * part / parts_; }
-    TileRange range(const Record<S>& record) const;
+    void make_headers(int64_t begin, int64_t end);
 
     Splats<S> splats_;
     Cutoffs cutoffs_;

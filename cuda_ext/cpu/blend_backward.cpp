@@ -27,6 +27,7 @@ struct BackwardTile {
     using Shape = TileShape<S>;
     // Blocks of pairs held at a time; 1 byte and two packs each.
     static constexpr int kStored = 1 << 14;
+    static constexpr int kSums = (kGeometry + C + 3) / 4 * 4;
 
     struct StoredPairs {
         alignas(64) S falloff[Shape::lanes], through[Shape::lanes];
@@ -42,7 +43,7 @@ struct BackwardTile {
     alignas(64) S behind[Shape::blocks][Shape::lanes];
     alignas(64) S through[Shape::blocks][Shape::lanes];
     StoredPairs pairs[kStored];
-    uint8_t blocks[kStored + 8];
+    uint8_t blocks[kStored + kSpare];
     std::vector<int> starts;  // of an entry's pairs
     std::vector<Checkpoint> checkpoints;
 
@@ -51,29 +52,31 @@ struct BackwardTile {
         starts.clear();
         starts.push_back(0);
         int stored = 0;
-        for (; from < count && stored + Shape::blocks <= kStored; ++from) {
-            if (from + 8 < count) prefetch(bins.record(entries[from + 8]));
-            const Record<S>& record = *reinterpret_cast<const Record<S>*>(bins.record(entries[from]));
-            const TileSplat<S> splat(record, tile_x, tile_y);
-            const int end = stored + list_blocks(at, record, splat.x, splat.y, blocks + stored);
-            for (; stored < end; ++stored) {
-                const int block = blocks[stored];
-                const P falloff = splat.falloff(splat.offset(at, block));
-                P t = P::load(through[block]);
-                t.store(pairs[stored].through);
-                falloff.store(pairs[stored].falloff);
-                blend_step(P(splat.opacity), falloff, t);
-                t.store(through[block]);
+        while (from < count && stored + kGroup * Shape::blocks <= kStored) {
+            const int64_t end = std::min(count, from + kGroup);
+            int listed = stored;
+            for (int64_t entry = from; entry < end; ++entry) {
+                if (entry + kGroup < count) prefetch_record(bins.record(entries[entry + kGroup]), C);
+                const Record<S>& record = *reinterpret_cast<const Record<S>*>(bins.record(entries[entry]));
+                listed += list_blocks(at, record, tile_x - record.mean_x, tile_y - record.mean_y, blocks + listed);
+                starts.push_back(listed);
             }
-            starts.push_back(stored);
+            const int* ends = starts.data() + starts.size() - (end - from);
+            for (; from < end; ++from, ++ends) {
+                const Record<S>& record = *reinterpret_cast<const Record<S>*>(bins.record(entries[from]));
+                const TileSplat<S> splat(record, tile_x, tile_y);
+                for (; stored < *ends; ++stored) {
+                    const int block = blocks[stored];
+                    const P falloff = splat.falloff(splat.offset(at, block));
+                    P t = P::load(through[block]);
+                    t.store(pairs[stored].through);
+                    falloff.store(pairs[stored].falloff);
+                    blend_step(P(splat.opacity), falloff, t);
+                    t.store(through[block]);
+                }
+            }
         }
         return from;
-    }
-
-    static void prefetch(const S* record) {
-        const char* bytes = reinterpret_cast<const char*>(record);
-        for (int64_t line = 0; line < record_stride(C) * int64_t(sizeof(S)); line += 64)
-            __builtin_prefetch(bytes + line);
     }
 
     // Writes the gradients of every entry of the tile.
@@ -96,7 +99,7 @@ struct BackwardTile {
                 sweep(bins, entries, begin, end, tile_x, tile_y);
             }
             for (int64_t entry = end; entry-- > begin;) {
-                if (entry >= begin + 4) prefetch(bins.record(entries[entry - 4]));
+                if (entry >= begin + kGroup) prefetch_record(bins.record(entries[entry - kGroup]), C);
                 const S* data = bins.record(entries[entry]);
                 blend_splat(
                     *reinterpret_cast<const Record<S>*>(data), data + kHeader, starts[entry - begin],
@@ -110,7 +113,7 @@ struct BackwardTile {
         const Record<S>& record, const S* features, int first, int end, S tile_x, S tile_y, S* out) {
         const TileSplat<S> splat(record, tile_x, tile_y);
         const P opacity(splat.opacity), zero(S(0));
-        P feature[C > 0 ? C : 1], sums[kGeometry + C];
+        P feature[C > 0 ? C : 1], sums[kSums];
         for (int c = 0; c < C; ++c) feature[c] = P(features[c]);
         for (auto& sum : sums) sum = zero;
         PairSums<P> geometry{zero, zero, zero, zero, zero, zero};
@@ -136,7 +139,7 @@ struct BackwardTile {
         sums[3] = geometry.skew2;
         sums[4] = geometry.skew_dy;
         sums[5] = geometry.dy2;
-        sum_lanes<S, kGeometry + C>(sums, out);
+        sum_lanes<kSums>(sums, out);
         const PairSums<S> total{out[0], out[1], out[2], out[3], out[4], out[5]};
         const SplatGradient<S> g = splat_gradient(total, record.opacity, record.w(), record.m, record.v());
         out[0] = g.mean_x;
@@ -166,6 +169,10 @@ void reduce(
             const int64_t high = std::min(end, low + chunk);
             std::memset(sums.data(), 0, (high - low) * stride * sizeof(S));
             for (int64_t tile = first_tile; tile < last_tile; ++tile) {
+                if (tile + 2 < last_tile) {
+                    const int64_t ahead = bins.offset(tile + 2) + (next[tile + 2 - first_tile] - bins.begin(tile + 2));
+                    for (int line = 0; line < 4; ++line) __builtin_prefetch(entry_gradients + ahead * stride + 16 * line);
+                }
                 const int32_t *entry = next[tile - first_tile], *tile_end = bins.end(tile);
                 const S* from = entry_gradients + (bins.offset(tile) + (entry - bins.begin(tile))) * stride;
                 for (; entry < tile_end && *entry < high; ++entry, from += stride) {
@@ -175,6 +182,11 @@ void reduce(
                 next[tile - first_tile] = entry;
             }
             for (int64_t i = low; i < high; ++i) {
+                if (i + 16 < high) {
+                    const int64_t later = splats.visible[i + 16];
+                    __builtin_prefetch(out.opacities + later, 1);
+                    __builtin_prefetch(out.features + later * splats.channels + first_channel, 1);
+                }
                 const S* sum = sums.data() + (i - low) * stride;
                 const int64_t point = splats.visible[i];
                 for (int k = 0; k < 2; ++k) out.means[2 * i + k] += sum[k];

@@ -18,7 +18,8 @@ struct ForwardTile {
     LaneCoordinates<S> at;
     alignas(64) S image[Shape::blocks][C > 0 ? C : 1][Shape::lanes];
     alignas(64) S through[Shape::blocks][Shape::lanes];
-    uint8_t blocks[Shape::blocks + 8];
+    uint8_t blocks[kGroup * Shape::blocks + kSpare];
+    int ends[kGroup];
 
     bool opaque() const {
         P most(S(0));
@@ -31,26 +32,30 @@ struct ForwardTile {
     void blend(const Bins<S>& bins, int64_t tile, S tile_x, S tile_y) {
         std::memset(image, 0, sizeof image);
         for (auto& block : through) P(S(1)).store(block);
-        const int32_t *first = bins.begin(tile), *end = bins.end(tile);
-        for (const int32_t* entry = first; entry < end; ++entry) {
-            if (entry + 8 < end) {
-                const char* next = reinterpret_cast<const char*>(bins.record(entry[8]));
-                for (int64_t line = 0; line < record_stride(C) * int64_t(sizeof(S)); line += 64)
-                    __builtin_prefetch(next + line);
-            }
+        const int32_t* entries = bins.begin(tile);
+        const int64_t count = bins.end(tile) - entries;
+        for (int64_t first = 0; first < count; first += kGroup) {
             // Nothing is seen behind pixels whose transmittance is 0, exactly.
-            if (((entry - first) & 63) == 63 && opaque()) return;
-            const S* data = bins.record(*entry);
-            blend_splat(*reinterpret_cast<const Record<S>*>(data), data + kHeader, tile_x, tile_y);
+            if ((first & 127) == 112 && opaque()) return;
+            const int64_t end = std::min(count, first + kGroup);
+            int listed = 0;
+            for (int64_t entry = first; entry < end; ++entry) {
+                if (entry + kGroup < count) prefetch_record(bins.record(entries[entry + kGroup]), C);
+                const Record<S>& record = *reinterpret_cast<const Record<S>*>(bins.record(entries[entry]));
+                listed += list_blocks(at, record, tile_x - record.mean_x, tile_y - record.mean_y, blocks + listed);
+                ends[entry - first] = listed;
+            }
+            int begin = 0;
+            for (int64_t entry = first; entry < end; begin = ends[entry - first], ++entry)
+                blend_splat(bins.record(entries[entry]), begin, ends[entry - first], tile_x, tile_y);
         }
     }
 
-    CATACAUSTICS_HD void blend_splat(const Record<S>& record, const S* features, S tile_x, S tile_y) {
-        const TileSplat<S> splat(record, tile_x, tile_y);
-        const int count = list_blocks(at, record, splat.x, splat.y, blocks);
+    CATACAUSTICS_HD void blend_splat(const S* data, int begin, int end, S tile_x, S tile_y) {
+        const TileSplat<S> splat(*reinterpret_cast<const Record<S>*>(data), tile_x, tile_y);
         P color[C > 0 ? C : 1];
-        for (int c = 0; c < C; ++c) color[c] = P(features[c]);
-        for (int i = 0; i < count; ++i) {
+        for (int c = 0; c < C; ++c) color[c] = P(data[kHeader + c]);
+        for (int i = begin; i < end; ++i) {
             const int block = blocks[i];
             const P falloff = splat.falloff(splat.offset(at, block));
             P t = P::load(through[block]);

@@ -207,9 +207,11 @@ struct ProjectGradients {
 
 constexpr int kCameraValues = 16;  // gradients to pose (3 x 4) and lens (4)
 
+// Gradients of the points [begin, end), of which rank[i] >= 0 is the place among the visible ones: points are walked in
+// their order, not near to far, so that the arrays stream through memory.
 template <class S>
 void project_backward_chunk(
-    const Points<S>& points, const View<Pack<S>>& view, S low_pass, const int64_t* visible, int64_t begin, int64_t end,
+    const Points<S>& points, const View<Pack<S>>& view, S low_pass, const int32_t* rank, int64_t begin, int64_t end,
     const ProjectGradients<S>& g, double* camera) {
     using P = Pack<S>;
     P sums[kCameraValues];
@@ -217,24 +219,26 @@ void project_backward_chunk(
     alignas(64) S in[5][P::size], out[7][P::size];
     for (int64_t first = begin; first < end; first += P::size) {
         const int here = int(std::min<int64_t>(P::size, end - first));
-        for (int lane = 0; lane < here; ++lane)
-            if (first + lane + 32 < end) {
-                const int64_t i = visible[first + lane + 32];
-                __builtin_prefetch(points.positions + 3 * i);
-                __builtin_prefetch(points.normals + 3 * i);
-                __builtin_prefetch(points.footprints + i);
+        int64_t some = -1;  // a visible point, to stand in for lanes without one
+        for (int lane = 0; lane < here; ++lane) {
+            if (rank[first + lane] >= 0) some = first + lane;
+            if (first + lane + 64 < end && rank[first + lane + 64] >= 0) {
+                __builtin_prefetch(g.means + 2 * rank[first + lane + 64]);
+                __builtin_prefetch(g.forms + 3 * rank[first + lane + 64]);
             }
+        }
+        if (some < 0) continue;
+        const auto seen = [&](int lane) { return lane < here && rank[first + lane] >= 0; };
         const PointPack<S> pack(points.positions, points.normals, points.footprints, [&](int lane) {
-            return visible[first + std::min(lane, here - 1)];
+            return seen(lane) ? first + lane : some;
         });
         for (int lane = 0; lane < P::size; ++lane) {
-            const bool used = lane < here;
-            const int64_t k = first + std::min(lane, here - 1);
-            in[0][lane] = used ? g.means[2 * k] : S(0);
-            in[1][lane] = used ? g.means[2 * k + 1] : S(0);
-            in[2][lane] = used ? g.forms[3 * k] : S(0);
-            in[3][lane] = used ? g.forms[3 * k + 1] : S(0);
-            in[4][lane] = used ? g.forms[3 * k + 2] : S(0);
+            const int64_t k = seen(lane) ? rank[first + lane] : 0;
+            in[0][lane] = seen(lane) ? g.means[2 * k] : S(0);
+            in[1][lane] = seen(lane) ? g.means[2 * k + 1] : S(0);
+            in[2][lane] = seen(lane) ? g.forms[3 * k] : S(0);
+            in[3][lane] = seen(lane) ? g.forms[3 * k + 1] : S(0);
+            in[4][lane] = seen(lane) ? g.forms[3 * k + 2] : S(0);
         }
         const auto projection = project_disk(view, pack.p(), pack.n(), pack.s(), P(low_pass));
         const DiskGradient<P> d = project_disk_backward(
@@ -248,7 +252,7 @@ void project_backward_chunk(
         const P values[7] = {d.position.x, d.position.y, d.position.z, d.normal.x, d.normal.y, d.normal.z, d.footprint};
         for (int k = 0; k < 7; ++k) values[k].store(out[k]);
         for (int lane = 0; lane < here; ++lane) {
-            const int64_t i = visible[first + lane];
+            const int64_t i = first + lane;
             for (int k = 0; k < 3; ++k) {
                 g.positions[3 * i + k] = out[k][lane];
                 g.normals[3 * i + k] = out[3 + k][lane];
@@ -267,11 +271,18 @@ int64_t project_backward(
     const Points<S>& points, const S* pose, const S* lens, S low_pass, int64_t count, const int64_t* visible,
     int threads, const ProjectGradients<S>& g) {
     const auto view = make_view<Pack<S>>(pose, lens);
-    const int64_t size = 1024, chunks = (count + size - 1) / size;
+    const int64_t size = 4096, chunks = (points.count + size - 1) / size;
+    Scratch<int32_t> rank(points.count);
+    parallel_for(threads, chunks, [&](int64_t chunk) {
+        std::fill(&rank[chunk * size], &rank[std::min(points.count, (chunk + 1) * size)], -1);
+    });
+    parallel_for(threads, (count + size - 1) / size, [&](int64_t chunk) {
+        for (int64_t k = chunk * size; k < std::min(count, (chunk + 1) * size); ++k) rank[visible[k]] = int32_t(k);
+    });
     std::vector<double> camera(chunks * kCameraValues);
     parallel_for(threads, chunks, [&](int64_t chunk) {
         project_backward_chunk(
-            points, view, low_pass, visible, chunk * size, std::min(count, (chunk + 1) * size), g,
+            points, view, low_pass, rank.data(), chunk * size, std::min(points.count, (chunk + 1) * size), g,
             camera.data() + chunk * kCameraValues);
     });
     for (int k = 0; k < kCameraValues; ++k) {

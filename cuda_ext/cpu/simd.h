@@ -24,27 +24,38 @@ constexpr int kVectorBytes = 16;
 // At least four lanes: a block of pixels is four wide.
 constexpr int lanes(int scalar_bytes) { return kVectorBytes / scalar_bytes < 4 ? 4 : kVectorBytes / scalar_bytes; }
 
-// Bits: integers as wide as the scalar. GCC wants vector types spelled out for each scalar, outside of templates.
+// Bits: integers as wide as the scalar. Vectors: GCC wants vector types spelled out, outside of templates.
 template <class S>
 struct Bits;
 template <>
 struct Bits<float> {
     using type = int32_t;
-    typedef float Raw __attribute__((vector_size(4 * lanes(4))));
-    typedef int32_t Mask __attribute__((vector_size(4 * lanes(4))));
 };
 template <>
 struct Bits<double> {
     using type = int64_t;
-    typedef double Raw __attribute__((vector_size(8 * lanes(8))));
-    typedef int64_t Mask __attribute__((vector_size(8 * lanes(8))));
 };
 
-template <class S>
+template <class S, int size>
+struct Vectors;
+#define CATACAUSTICS_VECTORS(S, SIZE)                                              \
+    template <>                                                                    \
+    struct Vectors<S, SIZE> {                                                      \
+        typedef S Raw __attribute__((vector_size(sizeof(S) * SIZE)));              \
+        typedef Bits<S>::type Mask __attribute__((vector_size(sizeof(S) * SIZE))); \
+    };
+CATACAUSTICS_VECTORS(float, 4)
+CATACAUSTICS_VECTORS(float, 8)
+CATACAUSTICS_VECTORS(float, 16)
+CATACAUSTICS_VECTORS(double, 4)
+CATACAUSTICS_VECTORS(double, 8)
+#undef CATACAUSTICS_VECTORS
+
+template <class S, int lane_count = lanes(sizeof(S))>
 struct Pack {
-    static constexpr int size = lanes(sizeof(S));
-    using Raw = typename Bits<S>::Raw;
-    using Mask = typename Bits<S>::Mask;
+    static constexpr int size = lane_count;
+    using Raw = typename Vectors<S, size>::Raw;
+    using Mask = typename Vectors<S, size>::Mask;
 
     Raw v;
 
@@ -119,13 +130,49 @@ CATACAUSTICS_HD Pack<double> exp2_or_zero(Pack<double> x, double floor) {
 template <class S>
 constexpr S kLowestExponent = sizeof(S) == 4 ? S(-126) : S(-1022);
 
-// out[i] = sum of the lanes of packs[i], i < count.
-template <class S, int count>
-CATACAUSTICS_HD void sum_lanes(const Pack<S>* packs, S* out) {
+#if defined(__has_builtin)
+#if __has_builtin(__builtin_shufflevector)
+#define CATACAUSTICS_SHUFFLES 1
+#endif
+#endif
+
+// Sums of the lanes of four packs.
+CATACAUSTICS_HD Pack<float, 4> sum_lanes_of_four(const Pack<float>* packs) {
+    using Quad = Pack<float, 4>::Raw;
+    Quad quads[4];
+    for (int i = 0; i < 4; ++i) {
+        Quad parts[Pack<float>::size / 4];
+        std::memcpy(parts, &packs[i].v, sizeof parts);
+        for (int width = Pack<float>::size / 8; width > 0; width /= 2)
+            for (int k = 0; k < width; ++k) parts[k] += parts[k + width];
+        quads[i] = parts[0];
+    }
+#if CATACAUSTICS_SHUFFLES
+    const auto pair = [](Quad a, Quad b) {  // a0 + a2, b0 + b2, a1 + a3, b1 + b3
+        return __builtin_shufflevector(a, b, 0, 4, 1, 5) + __builtin_shufflevector(a, b, 2, 6, 3, 7);
+    };
+    const Quad a = pair(quads[0], quads[1]), b = pair(quads[2], quads[3]);
+    return Pack<float, 4>(
+        Quad(__builtin_shufflevector(a, b, 0, 1, 4, 5) + __builtin_shufflevector(a, b, 2, 3, 6, 7)));
+#else
+    Quad sums;
+    for (int i = 0; i < 4; ++i) sums[i] = (quads[i][0] + quads[i][2]) + (quads[i][1] + quads[i][3]);
+    return Pack<float, 4>(sums);
+#endif
+}
+
+// out[i] = sum of the lanes of packs[i], i < count; count is a multiple of four, `out` is aligned to 16 bytes.
+template <int count>
+CATACAUSTICS_HD void sum_lanes(const Pack<float>* packs, float* out) {
+    static_assert(count % 4 == 0, "packs are summed in fours");
+    for (int i = 0; i < count; i += 4) sum_lanes_of_four(packs + i).store(out + i);
+}
+
+template <int count>
+CATACAUSTICS_HD void sum_lanes(const Pack<double>* packs, double* out) {
     for (int i = 0; i < count; ++i) {
-        S sum = 0;
-        for (int lane = 0; lane < Pack<S>::size; ++lane) sum += packs[i].v[lane];
-        out[i] = sum;
+        out[i] = 0;
+        for (int lane = 0; lane < Pack<double>::size; ++lane) out[i] += packs[i].v[lane];
     }
 }
 

@@ -73,28 +73,31 @@ class Pool {
             std::lock_guard<std::mutex> lock(mutex_);
             try {
                 for (; started_ < helpers; ++started_)
-                    std::thread(&Pool::serve, this, started_, generation_.load()).detach();
+                    std::thread(&Pool::serve, this, generation_.load()).detach();
             } catch (const std::system_error&) {
                 helpers = started_;  // the system gives no more threads: go on with those there are
             }
             job_ = &job;
-            wanted_ = helpers;
-            running_ = helpers;
+            places_ = helpers;
             generation_.fetch_add(1);
         }
         wake_.notify_all();
         job.work();
+        {
+            // Helpers that have not come by now are not waited for: on a busy machine that takes milliseconds.
+            std::lock_guard<std::mutex> lock(mutex_);
+            job_ = nullptr;
+        }
         for (int spin = 0; spin < kSpins && running_.load() > 0; ++spin) relax();
         std::unique_lock<std::mutex> lock(mutex_);
         done_.wait(lock, [&] { return running_.load() == 0; });
-        job_ = nullptr;
         return true;
     }
 
    private:
     static constexpr int kSpins = 2000;
 
-    void serve(int index, uint64_t seen) {
+    void serve(uint64_t seen) {
         for (;;) {
             for (int spin = 0; spin < kSpins && generation_.load() == seen; ++spin) relax();
             Job* job;
@@ -102,7 +105,9 @@ class Pool {
                 std::unique_lock<std::mutex> lock(mutex_);
                 wake_.wait(lock, [&] { return generation_.load() != seen; });
                 seen = generation_.load();
-                if (index >= wanted_) continue;
+                if (!job_ || places_ == 0) continue;
+                --places_;
+                running_.fetch_add(1);
                 job = job_;
             }
             job->work();
@@ -115,7 +120,7 @@ class Pool {
     std::condition_variable wake_, done_;
     std::atomic<uint64_t> generation_{0};
     std::atomic<int> running_{0};
-    int started_ = 0, wanted_ = 0;
+    int started_ = 0, places_ = 0;
     Job* job_ = nullptr;
 };
 

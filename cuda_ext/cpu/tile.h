@@ -39,6 +39,8 @@ struct LaneCoordinates {
     }
 };
 
+constexpr int log2_of(int power) { return power > 1 ? 1 + log2_of(power / 2) : 0; }
+
 // A splat seen from a tile: constants of the pair loop.
 template <class S>
 struct TileSplat {
@@ -68,23 +70,30 @@ struct TileSplat {
     }
 };
 
-// Writes the numbers of the blocks a splat can touch; returns how many. `numbers` has room for blocks + 8.
+// Entries whose blocks are listed ahead of the pair loop: the two overlap in the processor, and no branch of the one
+// waits for the other.
+constexpr int kGroup = 16;
+
+// Writes the numbers of the blocks a splat can touch; returns how many. `numbers` has room for blocks + kSpare.
+constexpr int kSpare = 32;
 template <class S>
 CATACAUSTICS_HD int list_blocks(const LaneCoordinates<S>& at, const Record<S>& r, S x, S y, uint8_t* numbers) {
-    using P = Pack<S>;
     using Shape = TileShape<S>;
-    using Integer = typename Bits<S>::type;
+    constexpr int rows_at_once = Shape::block_rows < Shape::lanes ? Shape::block_rows : Shape::lanes;
+    using P = Pack<S, rows_at_once>;
+    using Mask = typename P::Mask;
     const S v = r.v(), inv_w = S(kExponentScale) / r.scaled_w;
     const S reach_y = std::sqrt(r.reach2 / v);
     const S room = S(0.01) + S(4e-7) * std::abs(y);
-    const S top = -reach_y - y - room, bottom = reach_y - y + room;
-    const int first = !(top > S(0)) ? 0 : int(std::min(top, S(kTile))) / Shape::block_height;
-    const int last = !(bottom < S(kTile - 1)) ? Shape::block_rows - 1
-                     : bottom < S(0)          ? -1
-                                              : int(bottom) / Shape::block_height;
+    // Written so that values that are not numbers give all rows.
+    S top = -reach_y - y - room, bottom = reach_y - y + room;
+    top = top > S(0) ? top : S(0);
+    bottom = bottom < S(kTile - 1) ? bottom : S(kTile - 1);
+    const int first = int(top < S(kTile) ? top : S(kTile)) / Shape::block_height;
+    const int last = (int(bottom > S(-1) ? bottom + S(1) : S(0)) - 1) >> log2_of(Shape::block_height);
     const P room_x(S(0.01) + S(4e-7) * std::abs(x));
     int count = 0;
-    alignas(64) Integer begin[P::size], length[P::size];
+    alignas(64) typename Bits<S>::type begin[P::size], length[P::size];
     for (int row = first; row <= last; row += P::size) {
         const P low = P::load(at.row) + P(y + S(row * Shape::block_height));
         P left, right;
@@ -98,21 +107,30 @@ CATACAUSTICS_HD int list_blocks(const LaneCoordinates<S>& at, const Record<S>& r
         left = select(left < P(S(kTile)), left, P(S(kTile)));
         right = select(right < P(S(kTile - 1)), right, P(S(kTile - 1)));
         right = select(right > P(S(-1)), right, P(S(-1)));
-        using Mask = typename P::Mask;
         const Mask from = (kTile - __builtin_convertvector((P(S(kTile)) - left).v, Mask)) >> 2;
         const Mask to = (__builtin_convertvector((right + P(S(1))).v, Mask) - 1) >> 2;
         const Mask number = to - from + 1;
         *reinterpret_cast<Mask*>(begin) = from;
         *reinterpret_cast<Mask*>(length) = number > 0 ? number : Mask{};
-        const int here = std::min(P::size, last - row + 1);
-        for (int i = 0; i < here; ++i) {
-            const uint64_t block = uint64_t((row + i) * Shape::block_columns + begin[i]);
-            const uint64_t run = block * 0x0101010101010101ull + 0x0706050403020100ull;
-            std::memcpy(numbers + count, &run, 8);
-            count += int(length[i]);
+        // Eight numbers are written at once, of which the first `length` count; four rows at once, few splats have more.
+        const int here = last - row + 1 < P::size ? last - row + 1 : P::size;
+        for (int i = 0; i < here; i += 4) {
+            for (int k = i; k < i + 4; ++k) {
+                const uint64_t block = uint64_t((row + k) * Shape::block_columns + begin[k]);
+                const uint64_t run = block * 0x0101010101010101ull + 0x0706050403020100ull;
+                std::memcpy(numbers + count, &run, 8);
+                count += k < here ? int(length[k]) : 0;
+            }
         }
     }
     return count;
+}
+
+template <class S>
+CATACAUSTICS_HD void prefetch_record(const S* record, int channels) {
+    const char* bytes = reinterpret_cast<const char*>(record);
+    for (int64_t line = 0; line < record_stride(channels) * int64_t(sizeof(S)); line += 64)
+        __builtin_prefetch(bytes + line);
 }
 
 // Kernels are compiled for every number of channels up to this, and more channels are done in slices.
