@@ -4,6 +4,7 @@ import importlib.metadata
 import os
 import platform
 import shutil
+from typing import Literal
 
 from catacaustics.config import DoctorConfig
 
@@ -25,7 +26,7 @@ def _stereo() -> str:
     return "plane sweep in PyTorch (this pycolmap has no CUDA; a CUDA build would use COLMAP PatchMatch)"
 
 
-def _splat_self_test(backend: str) -> str:
+def _splat_self_test(backend: Literal["reference", "cpu"]) -> str:
     """How a backend was built and its time for a small forward and backward pass, or what is wrong with it."""
     import time
 

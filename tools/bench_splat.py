@@ -46,9 +46,10 @@ def random_splats(count: int, width: int, height: int, channels: int) -> tuple[l
 def count_pairs(scene: list[torch.Tensor], camera: Camera, config: SplatConfig) -> int:
     """Splat-pixel pairs: the area of the ellipses in pixels."""
     with torch.no_grad():
+        positions, normals, footprints = scene[:3]
         pose = torch.tensor(camera.camera_from_world, dtype=torch.float32)
-        lens = (camera.fx, camera.fy), (camera.cx, camera.cy)
-        forms = reference.project(*scene[:3], pose, *lens, config.low_pass).forms
+        focal, center = (camera.fx, camera.fy), (camera.cx, camera.cy)
+        forms = reference.project(positions, normals, footprints, pose, focal, center, config.low_pass).forms
         return int((math.pi * config.support**2 / (forms[:, 0] * forms[:, 2]).sqrt()).sum())
 
 

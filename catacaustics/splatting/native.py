@@ -244,7 +244,8 @@ def splat_project_backward(
     chosen = (len(visible), visible, torch.get_num_threads())
     n = len(positions)
     _library().call("project_backward", positions.dtype, n, *inputs, low_pass, *chosen, *g_screen, *g_inputs)
-    return tuple(g_inputs)
+    g_positions, g_normals, g_footprints, g_pose, g_lens = g_inputs
+    return g_positions, g_normals, g_footprints, g_pose, g_lens
 
 
 @splat_project_backward.register_fake
@@ -324,7 +325,8 @@ def splat_blend_backward(
     sizes, cuts = (len(means), features.shape[1]), (support, alpha_min, torch.get_num_threads())
     window = (x0, y0, width, height)
     _library().call("blend_backward", means.dtype, *sizes, *inputs, *window, *cuts, *g_outputs, *g_inputs)
-    return tuple(g_inputs)
+    g_means, g_forms, g_opacities, g_features = g_inputs
+    return g_means, g_forms, g_opacities, g_features
 
 
 @splat_blend_backward.register_fake
