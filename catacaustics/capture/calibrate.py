@@ -33,6 +33,9 @@ ERRORS, HYPOTHESES = (2.0, 3.0), 2
 """Relative poses looked for in each pair: two at each inlier threshold in pixels. More than one, because the loops tell
 right from wrong later, and a right one that is missing breaks the chain."""
 
+TIED_SHARE = 0.9
+"""Share of the photographs that loops should tie together; below it, other focal lengths are tried too."""
+
 
 class Stages:
     """Which stages are finished, and from which inputs (CAPTURE/work/stages.json)."""
@@ -178,8 +181,6 @@ def _find_features(config: CalibrateConfig, stages: Stages) -> tuple[list[sfm.Ph
 
 def _solve_cameras(photos: list[sfm.Photo], config: CalibrateConfig, work: Path) -> _Solution:
     """Relative poses, their cycle consistency, mapping, checks and repair."""
-    from tqdm import tqdm
-
     database, copies = work / "matches.db", work / "photos"
     features = sfm.read_features(database)
     matches = sfm.read_matches(database, features)
@@ -189,7 +190,7 @@ def _solve_cameras(photos: list[sfm.Photo], config: CalibrateConfig, work: Path)
     def cameras(factor: float) -> list[Any]:
         return [sfm.initial_camera(p, config.camera_model, factor) for p in photos]
 
-    factor = 1.2
+    factors = [1.2]
     if any(p.focal is None for p in photos):
         best_pairs = strongest(matches)
         factor, clear = search_focal(
@@ -197,17 +198,15 @@ def _solve_cameras(photos: list[sfm.Photo], config: CalibrateConfig, work: Path)
         )
         how = "from closed loops of photographs" if clear else "assumed: loops of photographs do not show it"
         print(f"  focal length: {factor:.2f} times the longer side, {how}", flush=True)
-    edges = []
-    with tqdm(total=len(matches) * len(ERRORS), desc="relative poses", unit="pair") as progress:
-        for error in ERRORS:
-            edges += sfm.relative_poses(features, matches, cameras(factor), error, 3000, HYPOTHESES, progress.update)
-    pairs = believable_pairs(edges, len(photos))
-    group = {i for e in pairs for i in (e.first, e.second)}
-    print(
-        f"  pairs: {len({(e.first, e.second) for e in edges})} with a common geometry, {len(pairs)} of them in loops "
-        f"that tie {len(group)} photographs together",
-        flush=True,
-    )
+        # The search is rough: where loops do not tie nearly all photographs together, a little to either side may.
+        factors = [factor, factor * 1.047, factor * 0.955]
+    factor, pairs = factors[0], _pairs_in_loops(features, matches, cameras(factors[0]), len(photos))
+    for other in factors[1:]:
+        if len(_tied(pairs)) >= TIED_SHARE * len(photos):
+            break
+        found = _pairs_in_loops(features, matches, cameras(other), len(photos))
+        if len(_tied(found)) > len(_tied(pairs)):
+            factor, pairs = other, found
     model = _map(database, copies, work, features, cameras(factor), pairs)
     if model is None:
         raise _no_overlap(len(photos))
@@ -225,6 +224,30 @@ def _solve_cameras(photos: list[sfm.Photo], config: CalibrateConfig, work: Path)
     for change in changes:
         print(f"  {photos[change.index].name} {change.action}: {change.reason}", flush=True)
     return _Solution(_full_size(model, photos, features, copies), checks, changes)
+
+
+def _pairs_in_loops(
+    features: sfm.Features, matches: dict[tuple[int, int], np.ndarray], cameras: list[Any], count: int
+) -> list[sfm.RelativePose]:
+    """Relative poses of all pairs, as far as loops of photographs believe them."""
+    from tqdm import tqdm
+
+    edges = []
+    with tqdm(total=len(matches) * len(ERRORS), desc="relative poses", unit="pair") as progress:
+        for error in ERRORS:
+            edges += sfm.relative_poses(features, matches, cameras, error, 3000, HYPOTHESES, progress.update)
+    pairs = believable_pairs(edges, count)
+    print(
+        f"  pairs: {len({(e.first, e.second) for e in edges})} with a common geometry, {len(pairs)} of them in loops "
+        f"that tie {len(_tied(pairs))} photographs together",
+        flush=True,
+    )
+    return pairs
+
+
+def _tied(pairs: list[sfm.RelativePose]) -> set[int]:
+    """Photographs that the pairs hold together."""
+    return {i for e in pairs for i in (e.first, e.second)}
 
 
 def _no_overlap(count: int) -> UserError:
