@@ -42,7 +42,7 @@ class Stage(NamedTuple):
     points: float
 
 
-STAGES = (Stage(0.1, 0.25, 1 / 32), Stage(0.25, 0.5, 1 / 6), Stage(1.0, 1.0, 1.0))
+STAGES = (Stage(0.05, 0.25, 1 / 32), Stage(0.15, 0.5, 1 / 6), Stage(1.0, 1.0, 1.0))
 """Multi-resolution warm-up: from 1/4 resolution and 1 point in 32, doubled twice (paper section 5.2)."""
 
 
