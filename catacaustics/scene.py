@@ -148,14 +148,21 @@ class Scene(nn.Module):
         with torch.no_grad():
             layers = self.layers(camera, viewport, warp_camera)
             nothing = torch.zeros_like(layers.primary)
+            weight = layers.rho[..., None]
             return RenderOutput(
-                self.decode(layers).clamp(0, 1),
-                self.renderer(layers.primary, nothing, layers.directions).clamp(0, 1),
-                self.renderer(nothing, layers.reflection, layers.directions).clamp(0, 1),
+                self._decode_strips((1 - weight) * layers.primary, weight * layers.reflection, layers.directions),
+                self._decode_strips(layers.primary, nothing, layers.directions),
+                self._decode_strips(nothing, layers.reflection, layers.directions),
                 layers.rho,
                 1 - layers.transmittance,
                 layers.depth,
             )
+
+    def _decode_strips(self, primary: Tensor, reflection: Tensor, directions: Tensor) -> Tensor:
+        """RGB in [0, 1], some rows at a time: activations of a whole image would not fit the processor's caches."""
+        rows = max(1, 16_384 // max(1, primary.shape[1]))
+        strips = zip(*(t.split(rows) for t in (primary, reflection, directions)), strict=True)
+        return torch.cat([self.renderer(*strip) for strip in strips]).clamp(0, 1)
 
     def _directions(self, camera: Camera, viewport: Viewport) -> Tensor:
         rays = torch.from_numpy(camera.ray_directions(pixel_centers(viewport))).to(self.primary.positions)

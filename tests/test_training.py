@@ -23,7 +23,7 @@ from catacaustics.training.initialize import (
     neighbor_footprints,
     start_cloud,
 )
-from catacaustics.training.optimizer import make_optimizer
+from catacaustics.training.optimizer import RowAdam, make_optimizer
 
 
 @pytest.fixture(scope="module")
@@ -160,6 +160,25 @@ def test_a_new_point_takes_what_its_nearest_point_has_learned():
         np.testing.assert_allclose(grown.features.detach()[new, :3], seeds.colors[new], rtol=1e-6)
 
 
+def test_rows_follow_adam_and_stand_still_while_they_have_no_gradient():
+    rng = torch.Generator().manual_seed(0)
+    start = torch.randn(6, 3, generator=rng)
+    ours, theirs = torch.nn.Parameter(start.clone()), torch.nn.Parameter(start[:3].clone())
+    settings = {"lr": 0.1, "weight_decay": 0.2}
+    rows = RowAdam([{"params": [ours], "name": "primary.features", "rows": True, **settings}])
+    dense = torch.optim.AdamW([theirs], eps=1e-15, **settings)
+    for step in range(5):
+        gradient = torch.randn(6, 3, generator=rng)
+        gradient[3:5] = 0
+        gradient[5] *= step == 3  # seen once: its first step, whatever the others have counted
+        ours.grad, theirs.grad = gradient, gradient[:3].clone()
+        rows.step()
+        dense.step()
+    torch.testing.assert_close(ours[:3], theirs, rtol=1e-5, atol=1e-6)
+    assert torch.equal(ours[3:5], start[3:5])
+    torch.testing.assert_close((ours[5] - start[5] * (1 - 0.1 * 0.2)).abs(), torch.full((3,), 0.1), rtol=1e-4, atol=0)
+
+
 def test_densification_spawns_downhill_keeps_moments_and_respects_the_cap(capture_path, tmp_path):
     scene = loop.train(small(capture_path, tmp_path / "run", iterations=4, densify_every=0))
     optimizer = make_optimizer(scene, small(capture_path, tmp_path))
@@ -167,7 +186,7 @@ def test_densification_spawns_downhill_keeps_moments_and_respects_the_cap(captur
     for group in optimizer.param_groups:
         p = group["params"][0]
         optimizer.state[p] = {
-            "step": torch.tensor(3.0),
+            "step": torch.full((len(p) if group["rows"] else 1,), 3.0),
             "exp_avg": torch.ones_like(p),
             "exp_avg_sq": torch.ones_like(p),
         }

@@ -4,7 +4,7 @@ import torch
 
 from catacaustics.scene import Scene
 from catacaustics.splatting import SplatOutput
-from catacaustics.training.optimizer import append_rows
+from catacaustics.training.optimizer import RowAdam, append_rows
 
 
 class GradientStatistics:
@@ -23,7 +23,7 @@ class GradientStatistics:
             self.seen.index_add_(0, splats.visible, torch.ones_like(gradient[:, 0]))
 
 
-def densify(scene: Scene, optimizer: torch.optim.AdamW, statistics: GradientStatistics, share: float, cap: int) -> int:
+def densify(scene: Scene, optimizer: RowAdam, statistics: GradientStatistics, share: float, cap: int) -> int:
     """The points with the highest mean view-space gradient spawn a copy one radius downhill. Returns how many.
 
     Args:

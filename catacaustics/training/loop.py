@@ -28,7 +28,7 @@ from catacaustics.training.initialize import (
     scene_extent,
     stage_count,
 )
-from catacaustics.training.optimizer import make_optimizer, optimizer_tensors, restore_optimizer, set_rates
+from catacaustics.training.optimizer import RowAdam, make_optimizer, optimizer_tensors, restore_optimizer, set_rates
 from catacaustics.training.photographs import PhotographCache, choose_patch, scaled_camera
 
 _LOG_EVERY = 10
@@ -51,7 +51,7 @@ class TrainState:
     """Everything that a checkpoint keeps."""
 
     scene: Scene
-    optimizer: torch.optim.AdamW
+    optimizer: RowAdam
     rng: np.random.Generator
     statistics: GradientStatistics
     step: int = 0

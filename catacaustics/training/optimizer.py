@@ -1,4 +1,9 @@
-"""Adam with a learning rate a kind of parameter; rows can be added without losing its moments."""
+"""Adam with a learning rate a kind of parameter, that leaves points alone which a step did not see.
+
+A patch shows a few thousand of the points. Dense Adam would go on moving all others by their momentum, and a point that
+is seen once in a hundred steps would travel 30 learning rates on one gradient. Here a row (a point) with no gradient
+keeps its value and its moments, and every row counts its own steps for the bias correction. Rows can be added.
+"""
 
 import math
 
@@ -32,7 +37,53 @@ def _rate(name: str, config: TrainConfig, extent: float, progress: float, warm_u
     return decay(start, start * config.lr_final_share)
 
 
-def make_optimizer(scene: Scene, config: TrainConfig) -> torch.optim.AdamW:
+class RowAdam(torch.optim.Optimizer):
+    """Adam (Kingma and Ba 2015), decoupled weight decay; in groups with `rows`, rows without a gradient stand still.
+
+    Args:
+        groups: one parameter each, with name, lr, weight_decay and rows.
+        betas, eps: as in Adam.
+    """
+
+    def __init__(self, groups: list[dict], betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-15):
+        super().__init__(groups, {"betas": betas, "eps": eps})
+
+    @torch.no_grad()
+    def step(self, closure: None = None) -> None:
+        for group in self.param_groups:
+            parameter = group["params"][0]
+            if parameter.grad is None or group["lr"] == 0:
+                continue
+            state = self.state[parameter]
+            if not state:
+                count = len(parameter) if group["rows"] else 1
+                state["step"] = torch.zeros(count, device=parameter.device)
+                state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
+            if group["rows"]:
+                seen = torch.nonzero(parameter.grad.reshape(len(parameter), -1).any(1))[:, 0]
+                tensors = (parameter, parameter.grad, *(state[k] for k in ("step", "exp_avg", "exp_avg_sq")))
+                rows = [t.index_select(0, seen) for t in tensors]
+                _adam(*rows, group)
+                for whole, part in zip(tensors, rows, strict=True):
+                    if whole is not parameter.grad:
+                        whole.index_copy_(0, seen, part)
+            else:
+                _adam(parameter, parameter.grad, state["step"], state["exp_avg"], state["exp_avg_sq"], group)
+
+
+def _adam(value: Tensor, gradient: Tensor, step: Tensor, mean: Tensor, square: Tensor, group: dict) -> None:
+    """One step in place; `step` has one count a row, or one for all."""
+    beta1, beta2 = group["betas"]
+    step += 1
+    mean.lerp_(gradient, 1 - beta1)
+    square.mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
+    shape = (-1,) + (1,) * (value.ndim - 1) if group["rows"] else ()
+    rate = group["lr"] * ((1 - beta2**step).sqrt() / (1 - beta1**step)).reshape(shape)
+    value.mul_(1 - group["lr"] * group["weight_decay"])
+    value.sub_(rate * mean / (square.sqrt() + group["eps"]))
+
+
+def make_optimizer(scene: Scene, config: TrainConfig) -> RowAdam:
     """One group a parameter, named. Weight decay acts on the warps only (paper section 5.2)."""
     groups = [
         {
@@ -40,20 +91,21 @@ def make_optimizer(scene: Scene, config: TrainConfig) -> torch.optim.AdamW:
             "name": name,
             "lr": 0.0,
             "weight_decay": config.warp_weight_decay if name.startswith("warps.") else 0.0,
+            "rows": name.startswith(("primary.", "reflections.")),
         }
         for name, parameter in scene.named_parameters()
         if parameter.requires_grad
     ]
     # Losses are weighted by 0.05 and spread over thousands of points: gradients are far below Adam's default eps.
-    return torch.optim.AdamW(groups, eps=1e-15, fused=True)
+    return RowAdam(groups, eps=1e-15)
 
 
-def set_rates(optimizer: torch.optim.AdamW, config: TrainConfig, extent: float, progress: float, warm_up: bool) -> None:
+def set_rates(optimizer: RowAdam, config: TrainConfig, extent: float, progress: float, warm_up: bool) -> None:
     for group in optimizer.param_groups:
         group["lr"] = _rate(group["name"], config, extent, progress, warm_up)
 
 
-def append_rows(optimizer: torch.optim.AdamW, module: nn.Module, prefix: str, rows: dict[str, Tensor]) -> None:
+def append_rows(optimizer: RowAdam, module: nn.Module, prefix: str, rows: dict[str, Tensor]) -> None:
     """Add rows to parameters of a module; the moments of new rows start at zero, those of old rows stay."""
     for group in optimizer.param_groups:
         attribute = group["name"].removeprefix(prefix + ".")
@@ -62,15 +114,14 @@ def append_rows(optimizer: torch.optim.AdamW, module: nn.Module, prefix: str, ro
         old = group["params"][0]
         grown = nn.Parameter(torch.cat([old.detach(), rows[attribute]]))
         state = optimizer.state.pop(old, {})
-        for key in ("exp_avg", "exp_avg_sq"):
-            if key in state:
-                state[key] = torch.cat([state[key], torch.zeros_like(rows[attribute])])
+        for key, value in state.items():
+            state[key] = torch.cat([value, value.new_zeros(len(rows[attribute]), *value.shape[1:])])
         optimizer.state[grown] = state
         group["params"] = [grown]
         setattr(module, attribute, grown)
 
 
-def optimizer_tensors(optimizer: torch.optim.AdamW) -> dict[str, Tensor]:
+def optimizer_tensors(optimizer: RowAdam) -> dict[str, Tensor]:
     """The moments as named tensors, for the checkpoint."""
     return {
         f"adam.{group['name']}.{key}": value
@@ -79,7 +130,7 @@ def optimizer_tensors(optimizer: torch.optim.AdamW) -> dict[str, Tensor]:
     }
 
 
-def restore_optimizer(optimizer: torch.optim.AdamW, tensors: dict[str, Tensor]) -> None:
+def restore_optimizer(optimizer: RowAdam, tensors: dict[str, Tensor]) -> None:
     for group in optimizer.param_groups:
         parameter = group["params"][0]
         state = {k: tensors.get(f"adam.{group['name']}.{k}") for k in ("step", "exp_avg", "exp_avg_sq")}
