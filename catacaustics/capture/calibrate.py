@@ -127,7 +127,9 @@ def calibrate(config: CalibrateConfig) -> Capture:
     write_capture(root, views, split, solution.model.points, solution.model.colors)
     capture = open_capture(root)
     write_report(root, capture, [p.name for p in photos], solution.checks, solution.changes, solution.model.points)
-    _fuse(capture, config, stages, [key, config.held_out_every, config.max_size], solution.model.points)
+    # The cameras themselves, not what they were made from: points never outlive cameras that were solved anew.
+    cameras = hashlib.sha256((root / "sparse/0/images.bin").read_bytes()).hexdigest()
+    _fuse(capture, config, stages, [cameras, config.held_out_every, config.max_size], solution.model.points)
     print(f"capture: {root} with {len(capture.views)} views; see {root / 'report.html'}", flush=True)
     return capture
 
