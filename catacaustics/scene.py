@@ -138,8 +138,7 @@ class Scene(nn.Module):
 
     def decode(self, layers: Layers) -> Float[Tensor, "height width 3"]:
         """RGB of splatted layers, not clamped: training needs the gradient outside [0, 1] too."""
-        weight = layers.rho[..., None]
-        return self.renderer((1 - weight) * layers.primary, weight * layers.reflection, layers.directions)
+        return self.renderer(*_weighted(layers), layers.directions)
 
     def render(
         self, camera: Camera, viewport: Viewport | None = None, warp_camera: Camera | None = None
@@ -148,9 +147,8 @@ class Scene(nn.Module):
         with torch.no_grad():
             layers = self.layers(camera, viewport, warp_camera)
             nothing = torch.zeros_like(layers.primary)
-            weight = layers.rho[..., None]
             return RenderOutput(
-                self._decode_strips((1 - weight) * layers.primary, weight * layers.reflection, layers.directions),
+                self._decode_strips(*_weighted(layers), layers.directions),
                 self._decode_strips(layers.primary, nothing, layers.directions),
                 self._decode_strips(nothing, layers.reflection, layers.directions),
                 layers.rho,
@@ -258,6 +256,12 @@ class Scene(nn.Module):
         ]
         scene = _from_state(parts, volumes, SplatConfig(**header["splatting"])).to(device)
         return scene, tensors, header["notes"]
+
+
+def _weighted(layers: Layers) -> tuple[Tensor, Tensor]:
+    """Primary features scaled by 1 - rho, reflection features by rho."""
+    rho = layers.rho[..., None]
+    return (1 - rho) * layers.primary, rho * layers.reflection
 
 
 def _rows(cloud: PointParameters, index: Tensor) -> list[Tensor]:

@@ -52,10 +52,8 @@ def choose_patch(
             x, y = columns[pick], rows[pick]
     else:
         # Uniform over positions of the patch, not of its middle: corners would be seen too often.
-        x, y = (
-            x * (camera.width - width) / camera.width + width / 2,
-            y * (camera.height - height) / camera.height + (height / 2),
-        )
+        x = x * (camera.width - width) / camera.width + width / 2
+        y = y * (camera.height - height) / camera.height + height / 2
     x0 = int(np.clip(round(x - width / 2), 0, camera.width - width))
     y0 = int(np.clip(round(y - height / 2), 0, camera.height - height))
     return Viewport(x0, y0, width, height)
