@@ -30,7 +30,7 @@ class CalibrateConfig:
 
 @dataclass(frozen=True)
 class SplatConfig:
-    """What the splatter computes; every cut-off is here and nowhere else."""
+    """What the splatter computes; every cut-off is here and nowhere else. The defaults are exact within `support`."""
 
     low_pass: float = 0.3
     """nu: variance in px^2 added to both axes of every footprint (a pixel-sized low-pass filter)."""
@@ -38,13 +38,28 @@ class SplatConfig:
     """Mahalanobis radius of a splat: it contributes nothing outside this ellipse (3.33: below 1/255 of its opacity)."""
     alpha_min: float = 0.0
     """Contributions with less alpha are dropped; 0 is exact, 1/255 is common practice."""
+    stop_transmittance: float = 0.0
+    """Early stop: what lies behind is not drawn in a pixel where transmittance has fallen below this; 0 is exact, 1e-4 is
+    common practice. Image and gradients belong to the same function."""
     near: float = 0.01
     """Points nearer to the camera plane than this (world units) are dropped."""
     guard_band: float = 0.5
     """Points whose centre lies farther outside the image than this share of its size are dropped: beside the camera the
     affine projection is meaningless, and one such point would cover the image."""
     pair_budget: int = 4_000_000
-    """Splat-pixel pairs held at a time: bounds memory at about 60 bytes a pair; results do not depend on it."""
+    """PyTorch only: splat-pixel pairs held at a time, about 60 bytes each; results do not depend on it."""
+    deterministic: bool = False
+    """GPU only: gradients are the same bit for bit in every run, at the price of memory and time (on the CPU they are)."""
+
+    @classmethod
+    def exact(cls, **settings: float) -> "SplatConfig":
+        """No cut-off but `support`; other settings by name."""
+        return cls(**({"alpha_min": 0.0, "stop_transmittance": 0.0} | settings))  # pyright: ignore[reportArgumentType]
+
+    @classmethod
+    def fast(cls, **settings: float) -> "SplatConfig":
+        """The usual cut-offs; what they cost in error: README. Other settings by name."""
+        return cls(**({"alpha_min": 1 / 255, "stop_transmittance": 1e-4} | settings))  # pyright: ignore[reportArgumentType]
 
 
 @dataclass(frozen=True)

@@ -34,11 +34,12 @@ def _splat_self_test(backend: Literal["reference", "cpu"]) -> str:
     import torch
 
     from catacaustics.cameras import Camera
-    from catacaustics.splatting import native, splat_points
+    from catacaustics.splatting import splat_points
+    from catacaustics.splatting.library import find_library
 
     built = "PyTorch"
     if backend == "cpu":
-        library, problem = native.find_library()
+        library, problem = find_library(backend)
         if library is None:
             return f"not available: {problem}"
         built = library.description

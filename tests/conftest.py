@@ -1,6 +1,6 @@
 """Shape annotations are enforced in every test; tests of the splatter run on each of its backends.
 
-`pytest --require cpu` fails instead of skipping where that backend is missing.
+`pytest --require cpu` fails instead of skipping where that backend is missing. `emulated`: the GPU's code on a CPU core.
 """
 
 import pytest
@@ -8,30 +8,32 @@ from jaxtyping import install_import_hook
 
 install_import_hook("catacaustics", "beartype.beartype")
 
-BACKENDS = ("reference", "cpu")
-
-
-def _problem(backend: str) -> str:
-    from catacaustics.splatting import native
-
-    return "" if backend == "reference" else native.find_library().problem
+import splatter  # noqa: E402
 
 
 def pytest_addoption(parser):
-    parser.addoption("--require", action="append", default=[], choices=BACKENDS, help="backend that must be tested")
+    parser.addoption(
+        "--require", action="append", default=[], choices=splatter.BACKENDS, help="backend that must be tested"
+    )
 
 
 def pytest_report_header():
-    return [f"splatter {name}: {_problem(name) or 'tested'}" for name in BACKENDS]
+    shown = [name for name in splatter.BACKENDS if name != "emulated"]  # which takes seconds to build
+    return [f"splatter {name}: {splatter.problem(name) or 'tested'}" for name in shown]
 
 
-@pytest.fixture(params=BACKENDS)
+@pytest.fixture(params=splatter.BACKENDS)
 def backend(request, monkeypatch):
     """Splats with each backend in turn; returns its name."""
-    problem = _problem(request.param)
-    if problem and request.param in request.config.getoption("--require"):
-        pytest.fail(f"no {request.param} backend: {problem}")
+    name, problem = request.param, splatter.problem(request.param)
+    if problem and name in request.config.getoption("--require"):
+        pytest.fail(f"no {name} backend: {problem}")
     if problem:
-        pytest.skip(f"no {request.param} backend: {problem}")
-    monkeypatch.setenv("CATACAUSTICS_SPLATTER", request.param)
-    return request.param
+        pytest.skip(f"no {name} backend: {problem}")
+    monkeypatch.setenv("CATACAUSTICS_SPLATTER", "cpu" if name == "emulated" else name)
+    if name == "cuda":
+        monkeypatch.setattr(splatter.device, "name", "cuda")
+    if name == "emulated":
+        for module in (splatter.splatting, splatter.library):
+            monkeypatch.setattr(module, "find_library", lambda _: splatter.emulated_library())
+    return name

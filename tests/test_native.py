@@ -10,13 +10,15 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from splatter import splat_points
 from test_splatting import NAMES, front_camera, random_scene, weighted_sum
 
 import catacaustics.splatting as splatting
 from catacaustics.cameras import Camera, Viewport
 from catacaustics.config import SplatConfig
 from catacaustics.errors import UserError
-from catacaustics.splatting import native, reference, splat_points
+from catacaustics.splatting import library, native
+from catacaustics.splatting.library import NativeError, find_library, load_library
 
 # Largest difference from the reference in float64, as a share of the largest value of each result.
 TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-11}
@@ -26,29 +28,29 @@ EVERYWHERE = [-1e9, -1e9, 1e9, 1e9]
 DTYPES = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
 
 needs_native = pytest.mark.skipif(
-    native.find_library().library is None, reason=f"no native splatter: {native.find_library().problem}"
+    find_library("cpu").library is None, reason=f"no native splatter: {find_library('cpu').problem}"
 )
 
 
-def results(splat, scene, camera, viewport, config):
+def results(scene, camera, viewport, config, backend=None):
     """Image, transmittance and every gradient, by name, as float64."""
     scene = [t.detach().clone().requires_grad_() for t in scene]
-    out = splat(*scene, camera, viewport, config)
+    out = splat_points(*scene, camera, viewport, config, backend)
     out.screen.retain_grad()
     weighted_sum(out.image.double(), out.transmittance.double()).backward()
     named = {"image": out.image, "transmittance": out.transmittance}
     if len(out.visible):
         # By point: two backends may put points that are drawn nowhere on different sides of the cull.
         screen = torch.zeros(len(scene[0]), 2, dtype=torch.float64)
-        named["screen"] = screen.index_copy(0, out.visible, out.screen.grad.double())
+        named["screen"] = screen.index_copy(0, out.visible, out.screen.grad.double().cpu())
     grads = {name: torch.zeros_like(t) if t.grad is None else t.grad for name, t in zip(NAMES, scene, strict=True)}
     return {name: t.detach().double() for name, t in (named | grads).items()}
 
 
 def assert_like_reference(scene, camera, viewport=None, config=WIDE, scale=1.0):
     """The backend under test agrees with the reference in float64 on the same numbers."""
-    got = results(splat_points, scene, camera, viewport, config)
-    want = results(reference.splat_points, [t.double() for t in scene], camera, viewport, config)
+    got = results(scene, camera, viewport, config)
+    want = results([t.double() for t in scene], camera, viewport, config, "reference")
     for name, expected in want.items():
         value = got.get(name, torch.zeros_like(expected))
         assert torch.isfinite(value).all(), name
@@ -91,8 +93,8 @@ def test_random_scenes_look_as_in_the_reference(dtype, n, channels, size, corner
     config = SplatConfig(support=8.0, alpha_min=alpha_min)
     window = Viewport(*corner, *shape)
     camera = front_camera(60, 50, 60.0)
-    want = results(reference.splat_points, [t.double() for t in scene], camera, window, config)
-    got = results(native.splat_points, scene, camera, window, config)
+    want = results([t.double() for t in scene], camera, window, config, "reference")
+    got = results(scene, camera, window, config, "cpu")
     for name, value in got.items():
         expected = want.get(name, torch.zeros_like(value))
         largest = max(float(expected.abs().max()), 1e-3) if expected.numel() else 0
@@ -271,7 +273,7 @@ def test_any_number_of_channels(backend, dtype, channels):
     if channels:
         assert_like_reference(scene, front_camera(), scale=2)
     else:
-        expected = reference.splat_points(*[t.double() for t in scene], front_camera(), None, WIDE)
+        expected = splat_points(*[t.double() for t in scene], front_camera(), None, WIDE, "reference")
         out = splat_points(*scene, front_camera(), None, WIDE)
         torch.testing.assert_close(out.transmittance.double(), expected.transmittance, rtol=1e-4, atol=1e-6)
 
@@ -281,7 +283,7 @@ def test_large_features_do_not_drown_small_ones_beside_them(backend, dtype):
     scene = random_scene(100, 2, dtype=dtype, size=0.1)
     scene[4] = scene[4] * torch.tensor([1e4, 1e-4], dtype=dtype)
     out = splat_points(*scene, front_camera(), None, WIDE)
-    expected = reference.splat_points(*[t.double() for t in scene], front_camera(), None, WIDE)
+    expected = splat_points(*[t.double() for t in scene], front_camera(), None, WIDE, "reference")
     for channel in range(2):
         largest = float(expected.image[..., channel].max())
         error = (out.image[..., channel] - expected.image[..., channel]).abs().max()
@@ -329,13 +331,16 @@ def test_the_operators_keep_torchs_rules():
     torch.library.opcheck(native.splat_project, project)
     with torch.no_grad():
         means, forms, visible = native.splat_project(*project)
+        screen = (means, forms, scene[3].detach(), visible, *window, 3.33, 0.0)
+        torch.library.opcheck(native.splat_bin, screen)
+        bins = native.splat_bin(*screen)
     inputs = [t.detach().requires_grad_() for t in (means, forms, scene[3], scene[4])]
-    blend = (*inputs, visible, *window, 3.33, 0.0)
+    blend = (*inputs, visible, *bins, *window, 0.0, False)
     torch.library.opcheck(native.splat_blend, blend)
     with torch.no_grad():
         image, transmittance = native.splat_blend(*blend)
-        plain = [t.detach() for t in blend[:5]]
-        torch.library.opcheck(native.splat_blend_backward, (image, transmittance, *plain, *window, 3.33, 0.0))
+        splats = (scene[4].detach(), visible, *bins, *window, 0.0, False)
+        torch.library.opcheck(native.splat_blend_backward, (image, transmittance, *splats))
         g = (torch.rand_like(means), torch.rand_like(forms))
         camera = [t.detach() for t in (*points, pose, lens)]
         torch.library.opcheck(native.splat_project_backward, (*g, *camera, visible, 0.3))
@@ -350,7 +355,7 @@ def test_results_are_the_same_bit_for_bit_for_every_number_of_threads(dtype):
     try:
         for threads in (1, 2, 3, 7):
             torch.set_num_threads(threads)
-            got = results(native.splat_points, scene, camera, None, SplatConfig())
+            got = results(scene, camera, None, SplatConfig(), "cpu")
             inputs = [t.clone().requires_grad_() for t in (pose, lens)]
             window = [0, 0, 200, 150]
             means, forms, _ = native.splat_project(*scene[:4], *inputs, *window, 0.3, 3.33, 0.0, 0.01, *EVERYWHERE)
@@ -371,7 +376,7 @@ def test_a_whole_image_has_the_gradients_of_its_halves_together():
     def gradients(*windows):
         leaves = [t.clone().requires_grad_() for t in scene]
         for x0, width in windows:
-            out = native.splat_points(*leaves, camera, Viewport(x0, 0, width, 400))
+            out = splat_points(*leaves, camera, Viewport(x0, 0, width, 400), backend="cpu")
             (out.image * weights[:, x0 : x0 + width]).sum().backward()
         return [t.grad for t in leaves]
 
@@ -382,7 +387,7 @@ def test_a_whole_image_has_the_gradients_of_its_halves_together():
 @needs_native
 def test_the_screen_positions_are_in_the_graph_for_densification():
     scene = [t.requires_grad_() for t in random_scene(30, dtype=torch.float32, size=0.1)]
-    out = native.splat_points(*scene, front_camera())
+    out = splat_points(*scene, front_camera(), backend="cpu")
     out.screen.retain_grad()
     out.image.sum().backward()
     assert out.screen.grad.abs().max() > 0
@@ -392,17 +397,17 @@ def test_the_screen_positions_are_in_the_graph_for_densification():
 @needs_native
 def test_every_variant_that_this_processor_runs_gives_the_same(monkeypatch):
     scene, camera = random_scene(2000, 6, dtype=torch.float32, size=0.05), front_camera(120, 90, 100.0)
-    best = results(native.splat_points, scene, camera, None, WIDE)
+    best = results(scene, camera, None, WIDE, "cpu")
     tried = 0
-    for path in sorted(native.find_library().library.path.parent.glob("*.so")):
+    for path in sorted(find_library("cpu").library.path.parent.glob("*.so")):
         try:
-            library = native.load_library(path)
-        except native.NativeError as error:
+            variant = load_library(path)
+        except NativeError as error:
             assert "needs instructions that this processor lacks" in str(error)  # noqa: PT017
             continue
         tried += 1
-        monkeypatch.setattr(native, "find_library", lambda library=library: native._Found(library, ""))
-        for name, value in results(native.splat_points, scene, camera, None, WIDE).items():
+        monkeypatch.setattr(library, "find_library", lambda _, variant=variant: library.Found(variant, ""))
+        for name, value in results(scene, camera, None, WIDE, "cpu").items():
             largest = float(best[name].abs().max())
             torch.testing.assert_close(value, best[name], rtol=0, atol=TOLERANCE[torch.float32] * largest)
     assert tried
@@ -413,12 +418,12 @@ def test_a_forked_process_splats_too():
     code = (
         "import os, sys, torch; sys.path.insert(0, sys.argv[1]);"
         "from test_splatting import random_scene, front_camera;"
-        "from catacaustics.splatting import native;"
+        "from catacaustics.splatting import splat_points;"
         "scene = random_scene(5000, dtype=torch.float32); torch.set_num_threads(2);"
-        "native.splat_points(*scene, front_camera());"
+        "splat_points(*scene, front_camera(), backend='cpu');"
         "child = os.fork();\n"
         "if child == 0:\n"
-        "    out = native.splat_points(*scene, front_camera()); os._exit(0 if out.image.max() > 0 else 1)\n"
+        "    out = splat_points(*scene, front_camera(), backend='cpu'); os._exit(0 if out.image.max() > 0 else 1)\n"
         "sys.exit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))"
     )
     subprocess.run([sys.executable, "-c", code, str(Path(__file__).parent)], check=True, timeout=100)
@@ -426,7 +431,7 @@ def test_a_forked_process_splats_too():
 
 @needs_native
 def test_a_library_that_is_missing_damaged_or_foreign_is_refused_with_a_reason(tmp_path):
-    whole = native.find_library().library.path.read_bytes()
+    whole = find_library("cpu").library.path.read_bytes()
     foreign = bytearray(whole)
     foreign[18:20] = b"\xb7\x00" if foreign[18:20] != b"\xb7\x00" else b"\x3e\x00"
     cases = {
@@ -440,23 +445,23 @@ def test_a_library_that_is_missing_damaged_or_foreign_is_refused_with_a_reason(t
         path = tmp_path / f"{name}.so"
         if data is not None:
             path.write_bytes(data)
-        with pytest.raises(native.NativeError, match=reason):
-            native.load_library(path)
+        with pytest.raises(NativeError, match=reason):
+            load_library(path)
 
 
 @needs_native
 def test_another_library_is_refused_and_the_best_of_several_is_taken(tmp_path, monkeypatch):
     other = next((Path(torch.__file__).parent / "lib").glob("libc10.*"))
-    with pytest.raises(native.NativeError, match=r"cannot be loaded.*catacaustics_abi"):
-        native.load_library(other)
+    with pytest.raises(NativeError, match=r"cannot be loaded.*catacaustics_abi"):
+        load_library(other)
     folder = tmp_path / "_native"
     folder.mkdir()
-    for installed in native.find_library().library.path.parent.glob("*.so"):
+    for installed in find_library("cpu").library.path.parent.glob("*.so"):
         (folder / installed.name).write_bytes(installed.read_bytes())
-    best = native.find_library().library.path.name  # the first that is tried
+    best = find_library("cpu").library.path.name  # the first that is tried
     (folder / best).write_bytes((folder / best).read_bytes()[:5000])
-    monkeypatch.setattr(native, "_folders", lambda: [folder])
-    found = native.find_library.__wrapped__()
+    monkeypatch.setattr(library, "_folders", lambda: [folder])
+    found = find_library.__wrapped__("cpu")
     if found.library is None:
         assert found.problem == f"{best} is cut short"
     else:
@@ -464,7 +469,7 @@ def test_another_library_is_refused_and_the_best_of_several_is_taken(tmp_path, m
 
 
 def test_without_a_library_the_reference_takes_over_and_says_so_once(monkeypatch, caplog):
-    monkeypatch.setattr(native, "find_library", lambda: native._Found(None, "it was never built"))
+    monkeypatch.setattr(splatting, "find_library", lambda _: library.Found(None, "it was never built"))
     splatting._say_once.cache_clear()
     monkeypatch.setenv("CATACAUSTICS_SPLATTER", "auto")
     for _ in range(3):

@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 import torch
+from splatter import splat_points
 
 from catacaustics.cameras import Camera, Viewport
 from catacaustics.config import SplatConfig
 from catacaustics.geometry import look_at
-from catacaustics.splatting import splat_points
 from catacaustics.splatting.reference import tangent_basis
 
 pytestmark = pytest.mark.usefixtures("backend")

@@ -3,7 +3,7 @@
 import functools
 import logging
 import os
-from typing import Literal
+from typing import Literal, get_args
 
 from torch import Tensor
 
@@ -12,11 +12,12 @@ from catacaustics.config import SplatConfig
 from catacaustics.errors import UserError
 from catacaustics.shapes import Float
 from catacaustics.splatting import native, reference
-from catacaustics.splatting.reference import SplatOutput, points_in_view
+from catacaustics.splatting.library import find_library
+from catacaustics.splatting.reference import Disks, SplatOutput, check_shapes, points_in_view
 
 __all__ = ["Backend", "SplatOutput", "backend_for", "points_in_view", "splat_points"]
 
-Backend = Literal["auto", "reference", "cpu"]
+Backend = Literal["auto", "reference", "cpu", "cuda"]
 _CHOICE = "CATACAUSTICS_SPLATTER"
 
 
@@ -26,7 +27,7 @@ def _say_once(message: str) -> None:
 
 
 def backend_for(device: str, backend: Backend | None = None) -> str:
-    """The backend that splats tensors of a device: `cpu` (native code) or `reference` (PyTorch).
+    """The backend that splats tensors of a device: `cpu`, `cuda` (native code) or `reference` (PyTorch).
 
     Args:
         device: "cpu" or "cuda".
@@ -37,20 +38,21 @@ def backend_for(device: str, backend: Backend | None = None) -> str:
         UserError: no such backend, or it does not run here.
     """
     choice = backend or os.environ.get(_CHOICE) or "auto"
-    if choice not in ("auto", "reference", "cpu"):
-        raise UserError(f"splatter backend {choice!r}", "auto, reference or cpu", f"check {_CHOICE} in the environment")
+    if choice not in get_args(Backend):
+        known = ", ".join(get_args(Backend))
+        raise UserError(f"splatter backend {choice!r}", known, f"check {_CHOICE} in the environment")
     if choice == "reference":
         return "reference"
-    if choice == "cpu" and device != "cpu":
-        raise UserError("splatter backend cpu for tensors on " + device, "tensors on the CPU", "use backend auto")
-    problem = native.find_library().problem if device == "cpu" else f"there is none for {device}"
+    if choice not in ("auto", device):
+        raise UserError(f"splatter backend {choice} for tensors on {device}", f"{device} or auto", "use backend auto")
+    problem = find_library(device).problem if device in ("cpu", "cuda") else f"there is none for {device}"
     if not problem:
-        return "cpu"
-    if choice == "cpu":
+        return device
+    if choice == device:
         raise UserError(
             f"no native splatter: {problem}",
             "the libraries that the build installs into catacaustics/_native",
-            "install the package again with a C++17 compiler, or use backend auto",
+            "use backend auto, or install again with the compiler; `catacaustics doctor` shows what there is",
         )
     _say_once(f"splatting in PyTorch, which is many times slower than native code: {problem}")
     return "reference"
@@ -84,7 +86,7 @@ def splat_points(
         ValueError: wrong shapes, types or devices, values that are not finite or out of range; the argument is named.
         UserError: the backend does not run here.
     """
-    splat = {"cpu": native.splat_points, "reference": reference.splat_points}[
-        backend_for(positions.device.type, backend)
-    ]
-    return splat(positions, normals, footprints, opacities, features, camera, viewport, config)
+    disks = Disks(positions, normals, footprints, opacities, features)
+    check_shapes(disks)
+    splat = reference.splat if backend_for(positions.device.type, backend) == "reference" else native.splat
+    return splat(disks, camera, viewport or camera.viewport, config or SplatConfig())

@@ -11,6 +11,7 @@ The quadratic form is kept as a sum of squares, so that it is never negative how
     d^T Sigma^-1 d = w (dx - m dy)^2 + v dy^2,   w = Sigma_22 / det Sigma, m = Sigma_12 / Sigma_22, v = 1 / Sigma_22
 
 Blending: alpha_i = o_i exp(-q_i / 2), front to back; T_{i+1} = T_i (1 - alpha_i); colour = sum_i c_i alpha_i T_i.
+A pair is drawn where q_i <= reach^2 (SplatConfig.support, alpha_min) and T_i >= stop_transmittance, else alpha_i = 0.
 Backward: R_N = dL/dT_out; dL/dalpha_i = T_i (g . c_i - R_i); R_{i-1} = alpha_i (g . c_i) + (1 - alpha_i) R_i.
 It divides by nothing, hence is exact at alpha = 1.
 
@@ -28,6 +29,17 @@ from torch import Tensor
 from catacaustics.cameras import Camera, Viewport
 from catacaustics.config import SplatConfig
 from catacaustics.shapes import Float, Int
+
+
+class Disks(NamedTuple):
+    """What is splatted. positions (n, 3) and unit normals (n, 3) in world space; footprints (n,): squared radii;
+    opacities (n,) in [0, 1]; features (n, channels)."""
+
+    positions: Float[Tensor, "n 3"]
+    normals: Float[Tensor, "n 3"]
+    footprints: Float[Tensor, "n"]
+    opacities: Float[Tensor, "n"]
+    features: Float[Tensor, "n channels"]
 
 
 class ProjectedSplats(NamedTuple):
@@ -168,8 +180,9 @@ def _list_pairs(means: Tensor, forms: Tensor, opacities: Tensor, reach2: Tensor,
     return _Pairs(splats, pixels, order, slots, per_rank.tolist(), by_count, falloff, alpha, dx, dy)
 
 
-def _transmittances(pairs: _Pairs, size: int) -> tuple[Tensor, Tensor]:
-    """T before each pair (splat-major), and T behind the last one for each pixel of the region."""
+def _transmittances(pairs: _Pairs, size: int, stop: float) -> tuple[_Pairs, Tensor, Tensor]:
+    """The pairs with alpha and falloff 0 where T is below `stop`; T before each pair (splat-major); T behind the last
+    one for each pixel of the region."""
     transparency = torch.empty_like(pairs.alpha)
     transparency[pairs.slots] = 1 - pairs.alpha
     before = torch.empty_like(transparency)
@@ -177,11 +190,16 @@ def _transmittances(pairs: _Pairs, size: int) -> tuple[Tensor, Tensor]:
     start = 0
     for n in pairs.ranks:
         before[start : start + n] = running[:n]
-        running[:n] *= transparency[start : start + n]
+        rank = transparency[start : start + n]
+        running[:n] *= torch.where(running[:n] >= stop, rank, 1) if stop > 0 else rank
         start += n
     out = torch.empty_like(running)
     out[pairs.by_count] = running
-    return before.index_select(0, pairs.slots), out
+    before = before.index_select(0, pairs.slots)
+    if stop > 0:
+        drawn = before >= stop
+        pairs = pairs._replace(alpha=pairs.alpha * drawn, falloff=pairs.falloff * drawn)
+    return pairs, before, out
 
 
 def _accumulate(rows: Tensor, columns: Tensor, values: Tensor, dense: Tensor, count: int) -> Tensor:
@@ -235,7 +253,7 @@ class _Blend(torch.autograd.Function):
     """Blend splats that are sorted near to far. Pairs beyond the budget are listed again in the backward pass."""
 
     @staticmethod
-    def forward(ctx, means, forms, opacities, features, reach2, extent, viewport, budget):
+    def forward(ctx, means, forms, opacities, features, reach2, extent, viewport, stop, budget):
         height, width, channels = viewport.height, viewport.width, features.shape[1]
         image = features.new_zeros(height, width, channels)
         transmittance = features.new_ones(height, width)
@@ -243,7 +261,7 @@ class _Blend(torch.autograd.Function):
         kept, room = [], budget
         for region, index in regions:
             pairs = _list_pairs(means[index], forms[index], opacities[index], reach2[index], region)
-            before, out = _transmittances(pairs, region.width * region.height)
+            pairs, before, out = _transmittances(pairs, region.width * region.height, stop)
             weights = (pairs.alpha * before).index_select(0, pairs.order)
             colors = _accumulate(
                 pairs.pixels[pairs.order], pairs.splats[pairs.order], weights, features[index], len(out)
@@ -254,7 +272,7 @@ class _Blend(torch.autograd.Function):
             room -= len(before)
             kept.append((pairs, before) if room >= 0 else None)
         ctx.save_for_backward(means, forms, opacities, features, reach2)
-        ctx.viewport, ctx.regions, ctx.kept = viewport, regions, kept
+        ctx.viewport, ctx.stop, ctx.regions, ctx.kept = viewport, stop, regions, kept
         return image, transmittance
 
     @staticmethod
@@ -264,14 +282,14 @@ class _Blend(torch.autograd.Function):
         for (region, index), kept in zip(ctx.regions, ctx.kept, strict=True):
             if kept is None:
                 pairs = _list_pairs(means[index], forms[index], opacities[index], reach2[index], region)
-                kept = pairs, _transmittances(pairs, region.width * region.height)[0]
+                kept = _transmittances(pairs, region.width * region.height, ctx.stop)[:2]
             rows, columns = _window(region, ctx.viewport)
             g = g_image[rows, columns].reshape(-1, g_image.shape[-1])
             g_out = g_transmittance[rows, columns].reshape(-1)
             parts = _backward_region(*kept, forms[index], features[index], g, g_out)
             for grad, part in zip(grads, parts, strict=True):
                 grad.index_add_(0, index, part)
-        return *grads, None, None, None, None
+        return *grads, None, None, None, None, None
 
 
 def _window(region: Viewport, viewport: Viewport) -> tuple[slice, slice]:
@@ -329,35 +347,10 @@ class SplatOutput(NamedTuple):
     screen: Float[Tensor, "m 2"]
 
 
-def splat_points(
-    positions: Float[Tensor, "n 3"],
-    normals: Float[Tensor, "n 3"],
-    footprints: Float[Tensor, "n"],
-    opacities: Float[Tensor, "n"],
-    features: Float[Tensor, "n channels"],
-    camera: Camera,
-    viewport: Viewport | None = None,
-    config: SplatConfig | None = None,
-) -> SplatOutput:
-    """Splat oriented disks into a viewport; differentiable in every tensor.
-
-    Points at equal depth keep their input order. Points behind the near plane or outside the guard band are dropped.
-    The colour is not normalised and has no background: blend one with `transmittance`.
-
-    Args:
-        positions, normals: world space; normals of unit length.
-        footprints: squared radii, world units squared, non-negative.
-        opacities: in [0, 1].
-        camera: pinhole camera in world units.
-        viewport: pixels to compute; the whole image by default.
-
-    Raises:
-        ValueError: wrong shapes, types or devices, values that are not finite or out of range; the argument is named.
-    """
-    config = config or SplatConfig()
-    viewport = viewport or camera.viewport
-    check_shapes(positions, normals, footprints, opacities, features)
-    check_values(positions=positions, normals=normals, footprints=footprints, opacities=opacities, features=features)
+def splat(disks: Disks, camera: Camera, viewport: Viewport, config: SplatConfig) -> SplatOutput:
+    """`splat_points` in PyTorch. Points behind the near plane or outside the guard band are dropped."""
+    positions, normals, footprints, opacities, features = disks
+    check_values(**disks._asdict())
     pose = torch.tensor(camera.camera_from_world, dtype=positions.dtype, device=positions.device)
     lens = ((camera.fx, camera.fy), (camera.cx, camera.cy))
     with torch.no_grad():
@@ -372,18 +365,10 @@ def splat_points(
         visible = torch.nonzero(touches)[:, 0]
         visible = visible[torch.argsort(rough.depths[visible], stable=True)]
         reach2, reach, visible = reach2[visible], reach[visible], candidates[visible]
-    chosen = (t.index_select(0, visible) for t in (positions, normals, footprints))
-    splats = project(*chosen, pose, *lens, config.low_pass)
-    image, transmittance = _Blend.apply(
-        splats.means,
-        splats.forms,
-        opacities.index_select(0, visible),
-        features.index_select(0, visible),
-        reach2,
-        reach,
-        viewport,
-        config.pair_budget,
-    )
+    positions, normals, footprints, opacities, features = (t.index_select(0, visible) for t in disks)
+    splats = project(positions, normals, footprints, pose, *lens, config.low_pass)
+    settings = (viewport, config.stop_transmittance, config.pair_budget)
+    image, transmittance = _Blend.apply(splats.means, splats.forms, opacities, features, reach2, reach, *settings)
     return SplatOutput(image, transmittance, visible, splats.means)
 
 
@@ -407,17 +392,12 @@ def _reach2(opacities: Tensor, config: SplatConfig) -> Tensor:
     return reach2
 
 
-def check_shapes(positions: Tensor, normals: Tensor, footprints: Tensor, opacities: Tensor, features: Tensor) -> None:
+def check_shapes(disks: Disks) -> None:
     """Raise ValueError, naming the argument, for shapes, types and devices that do not go together."""
-    n = len(positions)
-    expected = {
-        "positions": (positions, (n, 3)),
-        "normals": (normals, (n, 3)),
-        "footprints": (footprints, (n,)),
-        "opacities": (opacities, (n,)),
-        "features": (features, (n, features.shape[-1] if features.ndim else 0)),
-    }
-    for name, (tensor, shape) in expected.items():
+    positions = disks.positions
+    n, channels = len(positions), disks.features.shape[-1] if disks.features.ndim else 0
+    shapes = ((n, 3), (n, 3), (n,), (n,), (n, channels))
+    for (name, tensor), shape in zip(disks._asdict().items(), shapes, strict=True):
         if tuple(tensor.shape) != shape:
             raise ValueError(f"{name} must have shape {shape}, got {tuple(tensor.shape)}")
         if tensor.dtype != positions.dtype or tensor.dtype not in (torch.float32, torch.float64):

@@ -2,7 +2,7 @@
 #include <memory>
 #include <vector>
 
-#include "abi.h"
+#include "guarded.h"
 #include "tile.h"
 
 namespace catacaustics {
@@ -48,7 +48,8 @@ struct BackwardTile {
     std::vector<Checkpoint> checkpoints;
 
     // Front to back from entry `from`, storing the pairs, until they fill the store; returns the entry after the last.
-    int64_t sweep(const Bins<S>& bins, const int32_t* entries, int64_t from, int64_t count, S tile_x, S tile_y) {
+    int64_t sweep(
+        const Bins<S>& bins, const int32_t* entries, int64_t from, int64_t count, S tile_x, S tile_y, S stop) {
         starts.clear();
         starts.push_back(0);
         int stored = 0;
@@ -67,8 +68,8 @@ struct BackwardTile {
                 const TileSplat<S> splat(record, tile_x, tile_y);
                 for (; stored < *ends; ++stored) {
                     const int block = blocks[stored];
-                    const P falloff = splat.falloff(splat.offset(at, block));
                     P t = P::load(through[block]);
+                    const P falloff = splat.falloff(splat.offset(at, block), t, P(stop));
                     t.store(pairs[stored].through);
                     falloff.store(pairs[stored].falloff);
                     blend_step(P(splat.opacity), falloff, t);
@@ -80,23 +81,29 @@ struct BackwardTile {
     }
 
     // Writes the gradients of every entry of the tile.
-    void blend(const Bins<S>& bins, int64_t tile, S tile_x, S tile_y, S* out) {
+    void blend(const Bins<S>& bins, int64_t tile, S tile_x, S tile_y, S stop, S* out) {
         const int32_t* entries = bins.begin(tile);
-        const int64_t count = bins.end(tile) - entries;
+        int64_t count = bins.end(tile) - entries;
         for (auto& block : through) P(S(1)).store(block);
         checkpoints.clear();
         for (int64_t entry = 0; entry < count;) {
             checkpoints.emplace_back();
             checkpoints.back().entry = entry;
             std::memcpy(checkpoints.back().through, through, sizeof through);
-            entry = sweep(bins, entries, entry, count, tile_x, tile_y);
+            entry = sweep(bins, entries, entry, count, tile_x, tile_y, stop);
+            // Splats behind are drawn nowhere. (Without early stop they still count: the gradient of an opaque splat is
+            // the difference that it makes.)
+            if (stop > S(0) && opaque(through, stop)) {
+                std::memset(out + entry * gradient_stride(C), 0, (count - entry) * gradient_stride(C) * sizeof(S));
+                count = entry;
+            }
         }
         int64_t end = count;
         for (std::size_t k = checkpoints.size(); k-- > 0;) {
             const int64_t begin = checkpoints[k].entry;
             if (end < count) {
                 std::memcpy(through, checkpoints[k].through, sizeof through);
-                sweep(bins, entries, begin, end, tile_x, tile_y);
+                sweep(bins, entries, begin, end, tile_x, tile_y, stop);
             }
             for (int64_t entry = end; entry-- > begin;) {
                 if (entry >= begin + kGroup) prefetch_record(bins.record(entries[entry - kGroup]), C);
@@ -170,11 +177,11 @@ void reduce(
             std::memset(sums.data(), 0, (high - low) * stride * sizeof(S));
             for (int64_t tile = first_tile; tile < last_tile; ++tile) {
                 if (tile + 2 < last_tile) {
-                    const int64_t ahead = bins.offset(tile + 2) + (next[tile + 2 - first_tile] - bins.begin(tile + 2));
+                    const int64_t ahead = next[tile + 2 - first_tile] - bins.begin(first_tile);
                     for (int line = 0; line < 4; ++line) __builtin_prefetch(entry_gradients + ahead * stride + 16 * line);
                 }
                 const int32_t *entry = next[tile - first_tile], *tile_end = bins.end(tile);
-                const S* from = entry_gradients + (bins.offset(tile) + (entry - bins.begin(tile))) * stride;
+                const S* from = entry_gradients + (entry - bins.begin(first_tile)) * stride;
                 for (; entry < tile_end && *entry < high; ++entry, from += stride) {
                     S* to = sums.data() + (*entry - low) * stride;
                     for (int64_t k = 0; k < stride; ++k) to[k] += from[k];
@@ -201,14 +208,14 @@ void reduce(
 
 template <class S, int C>
 void blend_tiles(
-    const Bins<S>& bins, int64_t first_tile, int64_t last_tile, int threads, const Splats<S>& splats, int first_channel,
-    const Gradients<S>& gradients, S* entry_gradients) {
+    const Bins<S>& bins, int64_t first_tile, int64_t last_tile, int threads, S stop, const Splats<S>& splats,
+    int first_channel, const Gradients<S>& gradients, S* entry_gradients) {
     using Shape = TileShape<S>;
     const Window& w = bins.window;
     parallel_for(threads, last_tile - first_tile, [&](int64_t task) {
         static thread_local const std::unique_ptr<BackwardTile<S, C>> state(new BackwardTile<S, C>);
         const int64_t tile = first_tile + task;
-        const int64_t x0 = tile % w.tiles_x() * kTile, y0 = tile / w.tiles_x() * kTile;
+        const int64_t x0 = tile % w.tiles_x(kTile) * kTile, y0 = tile / w.tiles_x(kTile) * kTile;
         const int columns = int(std::min<int64_t>(kTile, w.width - x0));
         const int rows = int(std::min<int64_t>(kTile, w.height - y0));
         if (columns < kTile || rows < kTile) {
@@ -226,31 +233,28 @@ void blend_tiles(
             }
         }
         state->blend(
-            bins, tile, S(w.x0 + x0) + S(0.5), S(w.y0 + y0) + S(0.5),
-            entry_gradients + bins.offset(tile) * gradient_stride(C));
+            bins, tile, S(w.x0 + x0) + S(0.5), S(w.y0 + y0) + S(0.5), stop,
+            entry_gradients + bins.entries_between(first_tile, tile) * gradient_stride(C));
     });
 }
 
 template <class S>
 int64_t blend_backward(
-    const Splats<S>& splats, const Window& window, const Cutoffs& cutoffs, int threads, const Gradients<S>& gradients) {
-    if (window.width > 65535LL * kTile || window.height > 65535LL * kTile || splats.count > INT32_MAX)
-        return kTooLarge;
-    Bins<S> bins(splats, window, cutoffs, threads);
+    const Splats<S>& splats, const Window& window, S stop, int threads, const Gradients<S>& gradients) {
+    Bins<S> bins(splats, window);
     Scratch<S> entry_gradients;
     int64_t room = 0;
     int first = 0;
     do {
         const int channels = int(std::min<int64_t>(max_channels<S>, splats.channels - first));
-        bins.pack(first, channels);
+        bins.pack(first, channels, threads);
         const int64_t stride = gradient_stride(channels);
-        for (int64_t tile = 0; tile < window.tiles();) {
+        for (int64_t tile = 0; tile < window.tiles(kTile);) {
             const int64_t last = bins.batch_end(tile, kBatchBytes / (stride * int64_t(sizeof(S))));
             const int64_t needed = bins.entries_between(tile, last) * stride;
             if (needed > room) entry_gradients.allocate(room = needed);
-            bins.list(tile, last);
             with_channels<S>(channels, [&](auto c) {
-                blend_tiles<S, c()>(bins, tile, last, threads, splats, first, gradients, entry_gradients.data());
+                blend_tiles<S, c()>(bins, tile, last, threads, stop, splats, first, gradients, entry_gradients.data());
             });
             reduce(bins, tile, last, threads, entry_gradients.data(), splats, first, channels, gradients);
             tile = last;
@@ -263,21 +267,20 @@ int64_t blend_backward(
 }  // namespace
 
 // The gradients are added to what is there.
-#define CATACAUSTICS_BLEND_BACKWARD(S, NAME)                                                                           \
-    CATACAUSTICS_EXPORT int64_t NAME(                                                                                  \
-        int64_t count, int64_t channels, const S* means, const S* forms, const S* opacities, const S* features,        \
-        const int64_t* visible, int64_t x0, int64_t y0, int64_t width, int64_t height, double support,                 \
-        double alpha_min, int64_t threads, const S* g_image, const S* g_transmittance, S* g_means, S* g_forms,         \
-        S* g_opacities, S* g_features) {                                                                               \
+#define CATACAUSTICS_BLEND_BACKWARD(S, SUFFIX)                                                                         \
+    CATACAUSTICS_EXPORT int64_t catacaustics_blend_backward_##SUFFIX(                                                  \
+        const Run* run, int64_t count, int64_t channels, const S* features, const int64_t* visible,                    \
+        const Record<S>* records, const int64_t* starts, const int32_t* entries, int64_t x0, int64_t y0,               \
+        int64_t width, int64_t height, double stop, const S* g_image, const S* g_transmittance, S* g_means,            \
+        S* g_forms, S* g_opacities, S* g_features) {                                                                   \
         return guarded([&] {                                                                                           \
             return blend_backward<S>(                                                                                  \
-                {count, channels, means, forms, opacities, features, visible}, {x0, y0, width, height},                \
-                {support, alpha_min}, int(threads),                                                                    \
-                {g_image, g_transmittance, g_means, g_forms, g_opacities, g_features});                                \
+                {count, channels, features, visible, records, starts, entries}, {x0, y0, width, height}, S(stop),      \
+                int(run->threads), {g_image, g_transmittance, g_means, g_forms, g_opacities, g_features});             \
         });                                                                                                            \
     }
 
-CATACAUSTICS_BLEND_BACKWARD(float, catacaustics_blend_backward_f32)
-CATACAUSTICS_BLEND_BACKWARD(double, catacaustics_blend_backward_f64)
+CATACAUSTICS_BLEND_BACKWARD(float, f32)
+CATACAUSTICS_BLEND_BACKWARD(double, f64)
 
 }  // namespace catacaustics

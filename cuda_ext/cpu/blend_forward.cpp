@@ -1,14 +1,11 @@
 #include <cstring>
 #include <memory>
 
-#include "abi.h"
+#include "guarded.h"
 #include "tile.h"
 
 namespace catacaustics {
 namespace {
-
-// Entries listed at a time, which bounds memory (4 bytes each) where large splats cover many tiles.
-constexpr int64_t kBatchEntries = int64_t(1) << 25;
 
 template <class S, int C>
 struct ForwardTile {
@@ -21,22 +18,13 @@ struct ForwardTile {
     uint8_t blocks[kGroup * Shape::blocks + kSpare];
     int ends[kGroup];
 
-    bool opaque() const {
-        P most(S(0));
-        for (int b = 0; b < Shape::blocks; ++b) most = most + P::load(through[b]);
-        for (int i = 0; i < P::size; ++i)
-            if (most.v[i] != 0) return false;
-        return true;
-    }
-
-    void blend(const Bins<S>& bins, int64_t tile, S tile_x, S tile_y) {
+    void blend(const Bins<S>& bins, int64_t tile, S tile_x, S tile_y, S stop) {
         std::memset(image, 0, sizeof image);
         for (auto& block : through) P(S(1)).store(block);
         const int32_t* entries = bins.begin(tile);
         const int64_t count = bins.end(tile) - entries;
         for (int64_t first = 0; first < count; first += kGroup) {
-            // Nothing is seen behind pixels whose transmittance is 0, exactly.
-            if ((first & 127) == 112 && opaque()) return;
+            if ((first & 127) == 112 && opaque(through, stop)) return;
             const int64_t end = std::min(count, first + kGroup);
             int listed = 0;
             for (int64_t entry = first; entry < end; ++entry) {
@@ -47,18 +35,18 @@ struct ForwardTile {
             }
             int begin = 0;
             for (int64_t entry = first; entry < end; begin = ends[entry - first], ++entry)
-                blend_splat(bins.record(entries[entry]), begin, ends[entry - first], tile_x, tile_y);
+                blend_splat(bins.record(entries[entry]), begin, ends[entry - first], tile_x, tile_y, stop);
         }
     }
 
-    CATACAUSTICS_HD void blend_splat(const S* data, int begin, int end, S tile_x, S tile_y) {
+    CATACAUSTICS_HD void blend_splat(const S* data, int begin, int end, S tile_x, S tile_y, S stop) {
         const TileSplat<S> splat(*reinterpret_cast<const Record<S>*>(data), tile_x, tile_y);
         P color[C > 0 ? C : 1];
         for (int c = 0; c < C; ++c) color[c] = P(data[kHeader + c]);
         for (int i = begin; i < end; ++i) {
             const int block = blocks[i];
-            const P falloff = splat.falloff(splat.offset(at, block));
             P t = P::load(through[block]);
+            const P falloff = splat.falloff(splat.offset(at, block), t, P(stop));
             const P weight = blend_step(P(splat.opacity), falloff, t);
             t.store(through[block]);
             for (int c = 0; c < C; ++c) {
@@ -76,14 +64,13 @@ struct Target {
 };
 
 template <class S, int C>
-void blend_tiles(Bins<S>& bins, int64_t first_tile, int64_t last_tile, int threads, const Target<S>& target) {
+void blend_tiles(const Bins<S>& bins, int threads, S stop, const Target<S>& target) {
     using Shape = TileShape<S>;
     const Window& w = bins.window;
-    parallel_for(threads, last_tile - first_tile, [&](int64_t task) {
+    parallel_for(threads, w.tiles(kTile), [&](int64_t tile) {
         static thread_local const std::unique_ptr<ForwardTile<S, C>> state(new ForwardTile<S, C>);
-        const int64_t tile = first_tile + task;
-        const int64_t x0 = tile % w.tiles_x() * kTile, y0 = tile / w.tiles_x() * kTile;
-        state->blend(bins, tile, S(w.x0 + x0) + S(0.5), S(w.y0 + y0) + S(0.5));
+        const int64_t x0 = tile % w.tiles_x(kTile) * kTile, y0 = tile / w.tiles_x(kTile) * kTile;
+        state->blend(bins, tile, S(w.x0 + x0) + S(0.5), S(w.y0 + y0) + S(0.5), stop);
         const int columns = int(std::min<int64_t>(kTile, w.width - x0));
         const int rows = int(std::min<int64_t>(kTile, w.height - y0));
         for (int y = 0; y < rows; ++y) {
@@ -99,24 +86,15 @@ void blend_tiles(Bins<S>& bins, int64_t first_tile, int64_t last_tile, int threa
 }
 
 template <class S>
-int64_t blend(
-    const Splats<S>& splats, const Window& window, const Cutoffs& cutoffs, int threads, S* image, S* transmittance) {
-    if (window.width > 65535LL * kTile || window.height > 65535LL * kTile || splats.count > INT32_MAX)
-        return kTooLarge;
-    Bins<S> bins(splats, window, cutoffs, threads);
-    const int slice = max_channels<S>;
+int64_t blend(const Splats<S>& splats, const Window& window, S stop, int threads, S* image, S* transmittance) {
+    Bins<S> bins(splats, window);
     int first = 0;
     do {  // at least once: without channels there is still transmittance
-        const int channels = int(std::min<int64_t>(slice, splats.channels - first));
-        bins.pack(first, channels);
-        for (int64_t tile = 0; tile < window.tiles();) {
-            const int64_t last = bins.batch_end(tile, kBatchEntries);
-            bins.list(tile, last);
-            with_channels<S>(channels, [&](auto c) {
-                blend_tiles<S, c()>(bins, tile, last, threads, {image, transmittance, int(splats.channels), first});
-            });
-            tile = last;
-        }
+        const int channels = int(std::min<int64_t>(max_channels<S>, splats.channels - first));
+        bins.pack(first, channels, threads);
+        with_channels<S>(channels, [&](auto c) {
+            blend_tiles<S, c()>(bins, threads, stop, {image, transmittance, int(splats.channels), first});
+        });
         first += channels;
     } while (first < splats.channels);
     return 0;
@@ -124,19 +102,19 @@ int64_t blend(
 
 }  // namespace
 
-#define CATACAUSTICS_BLEND_FORWARD(S, NAME)                                                                            \
-    CATACAUSTICS_EXPORT int64_t NAME(                                                                                  \
-        int64_t count, int64_t channels, const S* means, const S* forms, const S* opacities, const S* features,        \
-        const int64_t* visible, int64_t x0, int64_t y0, int64_t width, int64_t height, double support,                 \
-        double alpha_min, int64_t threads, S* image, S* transmittance) {                                               \
+#define CATACAUSTICS_BLEND(S, SUFFIX)                                                                                  \
+    CATACAUSTICS_EXPORT int64_t catacaustics_blend_##SUFFIX(                                                           \
+        const Run* run, int64_t count, int64_t channels, const S* features, const int64_t* visible,                    \
+        const Record<S>* records, const int64_t* starts, const int32_t* entries, int64_t x0, int64_t y0,               \
+        int64_t width, int64_t height, double stop, S* image, S* transmittance) {                                      \
         return guarded([&] {                                                                                           \
             return blend<S>(                                                                                           \
-                {count, channels, means, forms, opacities, features, visible}, {x0, y0, width, height},                \
-                {support, alpha_min}, int(threads), image, transmittance);                                             \
+                {count, channels, features, visible, records, starts, entries}, {x0, y0, width, height}, S(stop),      \
+                int(run->threads), image, transmittance);                                                              \
         });                                                                                                            \
     }
 
-CATACAUSTICS_BLEND_FORWARD(float, catacaustics_blend_f32)
-CATACAUSTICS_BLEND_FORWARD(double, catacaustics_blend_f64)
+CATACAUSTICS_BLEND(float, f32)
+CATACAUSTICS_BLEND(double, f64)
 
 }  // namespace catacaustics

@@ -4,8 +4,8 @@
 #include <vector>
 
 #include "../math/projection.h"
-#include "abi.h"
 #include "bins.h"
+#include "guarded.h"
 #include "sort.h"
 
 namespace catacaustics {
@@ -19,18 +19,6 @@ struct Points {
     int64_t count;
     const S *positions, *normals, *footprints, *opacities;
 };
-
-template <class T, class S>
-View<T> make_view(const S* pose, const S* lens) {
-    View<T> view;
-    for (int i = 0; i < 3; ++i) view.row[i] = {T(pose[4 * i]), T(pose[4 * i + 1]), T(pose[4 * i + 2])};
-    view.translation = {T(pose[3]), T(pose[7]), T(pose[11])};
-    view.fx = T(lens[0]);
-    view.fy = T(lens[1]);
-    view.cx = T(lens[2]);
-    view.cy = T(lens[3]);
-    return view;
-}
 
 // A pack's worth of points, lane by lane; index(lane) names the point.
 template <class S>
@@ -60,14 +48,8 @@ struct PointPack {
 
 template <class S>
 bool all_finite(const S* values, int64_t count) {
-    using Integer = typename Bits<S>::type;
-    const Integer exponent = sizeof(S) == 4 ? Integer(0x7f800000) : Integer(0x7ff0000000000000);
-    Integer bad = 0;
-    for (int64_t i = 0; i < count; ++i) {
-        Integer bits;
-        std::memcpy(&bits, values + i, sizeof bits);
-        bad |= Integer((bits & exponent) == exponent);
-    }
+    int bad = 0;
+    for (int64_t i = 0; i < count; ++i) bad |= int(!is_finite(values[i]));
     return !bad;
 }
 
@@ -92,10 +74,9 @@ struct ProjectTarget {
 
 template <class S>
 struct Drawn {
-    Window window;
-    Cutoffs cutoffs;
-    S low_pass, near;
-    S guard[4];  // means must lie between: left, top, right, bottom
+    Frame<S> frame;
+    Cutoffs<S> cutoffs;
+    S low_pass;
 };
 
 template <class S>
@@ -110,9 +91,6 @@ int64_t project_chunk(
     SortItem<S>* items, Packed<S>* splats) {
     using P = Pack<S>;
     int64_t kept = 0;
-    const Window& window = drawn.window;
-    const S left = S(window.x0), right = S(window.x0 + window.width);
-    const S top = S(window.y0), bottom = S(window.y0 + window.height);
     alignas(64) S out[8][P::size], reach[P::size];
     for (int64_t first = begin; first < end; first += P::size) {
         const int here = int(std::min<int64_t>(P::size, end - first));
@@ -121,15 +99,7 @@ int64_t project_chunk(
         const auto splat = screen_splat(view, project_disk(view, pack.p(), pack.n(), pack.s(), P(drawn.low_pass)));
         for (int lane = 0; lane < P::size; ++lane)
             reach[lane] = drawn.cutoffs.reach2(points.opacities[first + std::min(lane, here - 1)]);
-        const P reach2 = P::load(reach);
-        const P reach_x = square_root(splat.variance_x * reach2), reach_y = square_root(splat.variance_y * reach2);
-        const auto guarded = (splat.depth > P(drawn.near)) & (splat.mean_x > P(drawn.guard[0])) &
-                             (splat.mean_y > P(drawn.guard[1])) & (splat.mean_x < P(drawn.guard[2])) &
-                             (splat.mean_y < P(drawn.guard[3]));
-        const auto touches = guarded & (splat.mean_x + reach_x > P(left)) &
-                             (splat.mean_x - reach_x < P(right)) & (splat.mean_y + reach_y > P(top)) &
-                             (splat.mean_y - reach_y < P(bottom)) & (reach2 > P(S(0))) &
-                             (splat.w >= P(S(0))) & (splat.v > P(S(0)));
+        const auto touches = can_touch(splat, P::load(reach), drawn.frame);
         splat.mean_x.store(out[0]);
         splat.mean_y.store(out[1]);
         splat.w.store(out[2]);
@@ -205,8 +175,6 @@ struct ProjectGradients {
     S *positions, *normals, *footprints, *pose, *lens;  // to the inputs
 };
 
-constexpr int kCameraValues = 16;  // gradients to pose (3 x 4) and lens (4)
-
 // Gradients of the points [begin, end), of which rank[i] >= 0 is the place among the visible ones: points are walked in
 // their order, not near to far, so that the arrays stream through memory.
 template <class S>
@@ -244,11 +212,9 @@ void project_backward_chunk(
         const DiskGradient<P> d = project_disk_backward(
             view, pack.p(), pack.n(), pack.s(), P(low_pass), projection,
             {P::load(in[0]), P::load(in[1]), P::load(in[2]), P::load(in[3]), P::load(in[4])});
-        const P camera_terms[kCameraValues] = {
-            d.row[0].x, d.row[0].y, d.row[0].z, d.translation.x, d.row[1].x, d.row[1].y, d.row[1].z, d.translation.y,
-            d.row[2].x, d.row[2].y, d.row[2].z, d.translation.z, d.fx,       d.fy,       d.cx,       d.cy,
-        };
-        for (int k = 0; k < kCameraValues; ++k) sums[k] = sums[k] + camera_terms[k];
+        P terms[kCameraValues];
+        camera_terms(d, terms);
+        for (int k = 0; k < kCameraValues; ++k) sums[k] = sums[k] + terms[k];
         const P values[7] = {d.position.x, d.position.y, d.position.z, d.normal.x, d.normal.y, d.normal.z, d.footprint};
         for (int k = 0; k < 7; ++k) values[k].store(out[k]);
         for (int lane = 0; lane < here; ++lane) {
@@ -305,38 +271,34 @@ int64_t finite(const S* values, int64_t count, int threads) {
 
 }  // namespace
 
-// means (count, 2), forms (count, 3) and visible (count) have room for all points; returns how many were written.
-// The pose has at least three rows of four; lens = fx, fy, cx, cy. In the backward pass, gradients of points that are
-// not visible are left as they are.
+// means (count, 2), forms (count, 3) and visible (count) have room for all points; returns how many were written. In the
+// backward pass, gradients of points that are not visible are left as they are.
 #define CATACAUSTICS_PROJECT(S, SUFFIX)                                                                                \
     CATACAUSTICS_EXPORT int64_t catacaustics_project_##SUFFIX(                                                         \
-        int64_t count, const S* positions, const S* normals, const S* footprints, const S* opacities, const S* pose,   \
-        const S* lens, int64_t x0, int64_t y0, int64_t width, int64_t height, double low_pass, double support,         \
-        double alpha_min, double near, double guard_left, double guard_top, double guard_right, double guard_bottom,   \
-        int64_t threads, S* means, S* forms, int64_t* visible) {                        \
+        const Run* run, int64_t count, const S* positions, const S* normals, const S* footprints, const S* opacities,  \
+        const S* pose, const S* lens, int64_t x0, int64_t y0, int64_t width, int64_t height, double low_pass,          \
+        double support, double alpha_min, double near, double guard_left, double guard_top, double guard_right,        \
+        double guard_bottom, S* means, S* forms, int64_t* visible) {                                                   \
         return guarded([&] {                                                                                           \
+            const Frame<S> frame{S(x0),         S(y0),        S(x0 + width),  S(y0 + height), S(guard_left),           \
+                                 S(guard_top),  S(guard_right), S(guard_bottom), S(near)};                             \
             return project<S>(                                                                                         \
                 {count, positions, normals, footprints, opacities}, pose, lens,                                        \
-                {{x0, y0, width, height},                                                                              \
-                 {support, alpha_min},                                                                                 \
-                 S(low_pass),                                                                                          \
-                 S(near),                                                                                              \
-                 {S(guard_left), S(guard_top), S(guard_right), S(guard_bottom)}},                                      \
-                int(threads), {means, forms, visible});                                                                \
+                {frame, {S(support), S(alpha_min)}, S(low_pass)}, int(run->threads), {means, forms, visible});         \
         });                                                                                                            \
     }                                                                                                                  \
     CATACAUSTICS_EXPORT int64_t catacaustics_project_backward_##SUFFIX(                                                \
-        int64_t count, const S* positions, const S* normals, const S* footprints, const S* pose, const S* lens,        \
-        double low_pass, int64_t visible_count, const int64_t* visible, int64_t threads, const S* g_means,             \
+        const Run* run, int64_t count, const S* positions, const S* normals, const S* footprints, const S* pose,       \
+        const S* lens, double low_pass, int64_t visible_count, const int64_t* visible, const S* g_means,               \
         const S* g_forms, S* g_positions, S* g_normals, S* g_footprints, S* g_pose, S* g_lens) {                       \
         return guarded([&] {                                                                                           \
             return project_backward<S>(                                                                                \
                 {count, positions, normals, footprints, nullptr}, pose, lens, S(low_pass), visible_count, visible,     \
-                int(threads), {g_means, g_forms, g_positions, g_normals, g_footprints, g_pose, g_lens});               \
+                int(run->threads), {g_means, g_forms, g_positions, g_normals, g_footprints, g_pose, g_lens});          \
         });                                                                                                            \
     }                                                                                                                  \
-    CATACAUSTICS_EXPORT int64_t catacaustics_finite_##SUFFIX(const S* values, int64_t count, int64_t threads) {        \
-        return guarded([&] { return finite(values, count, int(threads)); });                                           \
+    CATACAUSTICS_EXPORT int64_t catacaustics_finite_##SUFFIX(const Run* run, const S* values, int64_t count) {         \
+        return guarded([&] { return finite(values, count, int(run->threads)); });                                      \
     }
 
 CATACAUSTICS_PROJECT(float, f32)

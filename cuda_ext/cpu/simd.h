@@ -1,8 +1,6 @@
 // Packs of lanes: GCC/Clang vector extensions with operators, so that math/ compiles for them as for a scalar.
 #pragma once
 
-#include <cstdint>
-#include <cstring>
 #include <type_traits>
 
 #include "../math/common.h"
@@ -24,18 +22,7 @@ constexpr int kVectorBytes = 16;
 // At least four lanes: a block of pixels is four wide.
 constexpr int lanes(int scalar_bytes) { return kVectorBytes / scalar_bytes < 4 ? 4 : kVectorBytes / scalar_bytes; }
 
-// Bits: integers as wide as the scalar. Vectors: GCC wants vector types spelled out, outside of templates.
-template <class S>
-struct Bits;
-template <>
-struct Bits<float> {
-    using type = int32_t;
-};
-template <>
-struct Bits<double> {
-    using type = int64_t;
-};
-
+// GCC wants vector types spelled out, outside of templates.
 template <class S, int size>
 struct Vectors;
 #define CATACAUSTICS_VECTORS(S, SIZE)                                              \
@@ -122,13 +109,9 @@ CATACAUSTICS_HD Pack<float> exp2_or_zero(Pack<float> x, float floor) {
 }
 
 CATACAUSTICS_HD Pack<double> exp2_or_zero(Pack<double> x, double floor) {
-    for (int i = 0; i < Pack<double>::size; ++i) x.v[i] = x.v[i] >= floor ? exp2(x.v[i]) : 0;
+    for (int i = 0; i < Pack<double>::size; ++i) x.v[i] = exp2_or_zero(x.v[i], floor);
     return x;
 }
-
-// The smallest exponent exp2_or_zero takes.
-template <class S>
-constexpr S kLowestExponent = sizeof(S) == 4 ? S(-126) : S(-1022);
 
 #if defined(__has_builtin)
 #if __has_builtin(__builtin_shufflevector)

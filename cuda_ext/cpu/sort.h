@@ -1,32 +1,19 @@
 // Stable radix sort of (key, place), least significant digits first, with threads.
 #pragma once
 
-#include <cstdint>
-#include <cstring>
+#include <algorithm>
 #include <vector>
 
-#include "simd.h"
+#include "../math/common.h"
 #include "threads.h"
 
 namespace catacaustics {
-
-template <class S>
-using SortKey = typename std::make_unsigned<typename Bits<S>::type>::type;
 
 template <class S>
 struct SortItem {
     SortKey<S> key;
     int32_t place;
 };
-
-// Orders as the numbers do: the sign bit is flipped, and negative numbers are reversed.
-template <class S>
-SortKey<S> sort_key(S value) {
-    typename Bits<S>::type bits;
-    std::memcpy(&bits, &value, sizeof bits);
-    constexpr int last = sizeof(S) * 8 - 1;
-    return SortKey<S>(bits) ^ (SortKey<S>(bits >> last) | (SortKey<S>(1) << last));
-}
 
 // Sorts `items` with the help of `other`; returns the one that holds the result.
 template <class S>

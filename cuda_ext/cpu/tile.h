@@ -55,7 +55,7 @@ struct TileSplat {
           opacity(r.opacity),
           scaled_w(r.scaled_w),
           scaled_v(r.scaled_v),
-          floor(std::max(r.reach2 * S(kExponentScale), kLowestExponent<S>)) {}
+          floor(r.floor()) {}
 
     struct Offset {
         Pack<S> skew, dy;
@@ -65,10 +65,26 @@ struct TileSplat {
         const P dy = P::load(at.y[block >> 3]) + P(y);
         return {(P::load(at.x[block & 7]) + P(x)) - P(m) * dy, dy};
     }
-    CATACAUSTICS_HD Pack<S> falloff(const Offset& d) const {
-        return exp2_or_zero(exponent(d.skew, d.dy, Pack<S>(scaled_w), Pack<S>(scaled_v)), floor);
+    // 0 where the splat is not drawn: outside of its ellipse, and where less than `stop` of the light gets through.
+    CATACAUSTICS_HD Pack<S> falloff(const Offset& d, Pack<S> through, Pack<S> stop) const {
+        const Pack<S> inside = exp2_or_zero(exponent(d.skew, d.dy, Pack<S>(scaled_w), Pack<S>(scaled_v)), floor);
+        return select(through >= stop, inside, Pack<S>(S(0)));
     }
 };
+
+// Whether no pixel of a tile has as much transmittance as `stop` left, or any at all.
+template <class S>
+bool opaque(const S (&through)[TileShape<S>::blocks][TileShape<S>::lanes], S stop) {
+    using P = Pack<S>;
+    P most(S(0));
+    for (const auto& block : through) {
+        const P t = P::load(block);
+        most = select(t > most, t, most);
+    }
+    for (int i = 0; i < P::size; ++i)
+        if (most.v[i] >= stop && most.v[i] != S(0)) return false;
+    return true;
+}
 
 // Entries whose blocks are listed ahead of the pair loop: the two overlap in the processor, and no branch of the one
 // waits for the other.

@@ -51,6 +51,19 @@ struct ScreenSplat {
     T depth;
 };
 
+// The pose has at least three rows of four; lens = fx, fy, cx, cy.
+template <class T, class S>
+CATACAUSTICS_HD View<T> make_view(const S* pose, const S* lens) {
+    View<T> view;
+    for (int i = 0; i < 3; ++i) view.row[i] = {T(pose[4 * i]), T(pose[4 * i + 1]), T(pose[4 * i + 2])};
+    view.translation = {T(pose[3]), T(pose[7]), T(pose[11])};
+    view.fx = T(lens[0]);
+    view.fy = T(lens[1]);
+    view.cx = T(lens[2]);
+    view.cy = T(lens[3]);
+    return view;
+}
+
 // What the forward and the backward pass both need.
 template <class T>
 struct Projection {
@@ -111,6 +124,26 @@ CATACAUSTICS_HD ScreenSplat<T> screen_splat(const View<T>& view, const Projectio
     return {view.fx * r.u + view.cx, view.fy * r.v + view.cy, r.w, r.m, r.inv_s22, r.s11, r.s22, r.camera.z};
 }
 
+// What is drawn of a view: the window's sides in pixels, the guard band in which means must lie, the near plane.
+template <class S>
+struct Frame {
+    S left, top, right, bottom;
+    S guard_left, guard_top, guard_right, guard_bottom;
+    S near;
+};
+
+// Whether a splat of squared reach `reach2` can touch the window. False for values that are not numbers.
+template <class T, class S>
+CATACAUSTICS_HD auto can_touch(const ScreenSplat<T>& splat, T reach2, const Frame<S>& frame) {
+    const T reach_x = square_root(splat.variance_x * reach2), reach_y = square_root(splat.variance_y * reach2);
+    const auto guarded = (splat.depth > T(frame.near)) & (splat.mean_x > T(frame.guard_left)) &
+                         (splat.mean_y > T(frame.guard_top)) & (splat.mean_x < T(frame.guard_right)) &
+                         (splat.mean_y < T(frame.guard_bottom));
+    return guarded & (splat.mean_x + reach_x > T(frame.left)) & (splat.mean_x - reach_x < T(frame.right)) &
+           (splat.mean_y + reach_y > T(frame.top)) & (splat.mean_y - reach_y < T(frame.bottom)) & (reach2 > T(0)) &
+           (splat.w >= T(0)) & (splat.v > T(0));
+}
+
 template <class T>
 struct ScreenGradient {
     T mean_x, mean_y, w, m, v;
@@ -125,6 +158,23 @@ struct DiskGradient {
     Vec3<T> translation;
     T fx, fy, cx, cy;
 };
+
+// What a disk adds to the gradients of the pose (three rows of four) and of the lens.
+constexpr int kCameraValues = 16;
+template <class T>
+CATACAUSTICS_HD void camera_terms(const DiskGradient<T>& g, T (&terms)[kCameraValues]) {
+    const T translation[3] = {g.translation.x, g.translation.y, g.translation.z};
+    for (int i = 0; i < 3; ++i) {
+        terms[4 * i] = g.row[i].x;
+        terms[4 * i + 1] = g.row[i].y;
+        terms[4 * i + 2] = g.row[i].z;
+        terms[4 * i + 3] = translation[i];
+    }
+    terms[12] = g.fx;
+    terms[13] = g.fy;
+    terms[14] = g.cx;
+    terms[15] = g.cy;
+}
 
 template <class T>
 CATACAUSTICS_HD DiskGradient<T> project_disk_backward(
