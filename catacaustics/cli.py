@@ -2,6 +2,7 @@
 
 import importlib
 import sys
+from typing import Annotated
 
 from catacaustics.errors import UserError
 
@@ -9,7 +10,8 @@ from catacaustics.errors import UserError
 _COMMANDS = {
     "reconstruct": ("catacaustics.reconstruct", "reconstruct", "ReconstructConfig"),
     "calibrate": ("catacaustics.capture.calibrate", "calibrate", "CalibrateConfig"),
-    "train": ("catacaustics.training.loop", "train", "TrainConfig"),
+    "mask": ("catacaustics.web.server", "mask", "MaskConfig"),
+    "train": ("catacaustics.training.train", "train", "TrainConfig"),
     "evaluate": ("catacaustics.evaluation", "evaluate", "EvaluateConfig"),
     "render": ("catacaustics.video", "render_video", "RenderConfig"),
     "doctor": ("catacaustics.doctor", "doctor", "DoctorConfig"),
@@ -46,6 +48,9 @@ def main(arguments: list[str] | None = None) -> int:
 
     module, function, name = _COMMANDS[command]
     config_type = getattr(importlib.import_module("catacaustics.config"), name)
+    for field in [f for f in config_type.__annotations__ if f.endswith("_")]:  # import_: the name is a Python keyword
+        kind = config_type.__annotations__[field]
+        config_type.__annotations__[field] = Annotated[kind, tyro.conf.arg(name=field.removesuffix("_"))]
     config = tyro.cli(tyro.conf.PositionalRequiredArgs[config_type], prog=f"catacaustics {command}", args=arguments[1:])
     try:
         getattr(importlib.import_module(module), function)(config)

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
+Model = Literal["auto", "none", "static", "plane", "sphere", "ellipsoid", "concave", "neural", "quadric+neural"]
+"""Rungs of the ladder of warps (reflectors/warps.py); auto chooses by trials, none trains the primary cloud alone."""
+
 
 @dataclass(frozen=True)
 class CalibrateConfig:
@@ -70,8 +73,9 @@ class TrainConfig:
     """Folder made by `catacaustics calibrate`."""
     run: Path
     """Folder to write: scene.safetensors, checkpoint, metrics.jsonl, report.html."""
-    warp: Literal["none", "static", "neural"] = "neural"
-    """How reflection points follow the camera; none trains the primary cloud alone."""
+    model: tuple[Model, ...] = ("auto",)
+    """What a reflector is: one name for all, or one for each in order of their names. auto chooses by short trials,
+    none trains the primary cloud alone; concave is an ellipsoid seen from inside."""
     resume: bool = False
     """Go on from the run's last checkpoint."""
     iterations: int = 30_000
@@ -86,12 +90,13 @@ class TrainConfig:
     """Patches whose gradients are summed before a step (paper: 20)."""
     reflector_share: float = 0.5
     """Share of patches centred on a reflector; the others are anywhere."""
-    primary_points: int = 200_000
-    """Primary points at the start, at most; the cloud is thinned at random."""
+    primary_points: int | None = None
+    """Primary points at the start, at most; the cloud is thinned at random. Left out, the images' size decides, and
+    trials, where a model is auto."""
     max_primary_points: int = 1_000_000
     """Densification never exceeds this."""
-    reflection_points: int = 50_000
-    """Points on each reflection volume (paper: 400 000)."""
+    reflection_points: int | None = None
+    """Points of each reflector (paper: 400 000). Left out, its size in the images decides, and trials."""
     environment_width: int = 1000
     """Columns of the environment map (rows: 0.4 of it); 0 leaves it out."""
     warp_layers: int = 4
@@ -109,6 +114,10 @@ class TrainConfig:
     weight_tv: float = 1e-5
     lr_position: float = 1.6e-4
     lr_position_final: float = 1.6e-6
+    lr_source: float = 2e-3
+    """Of reflection points' positions, relative to their distance from the reflector; decays to 1/10."""
+    lr_shape: float = 2e-3
+    """Of a mirror's position, radii and rotation, relative to its radius and in radians; decays to 1/10."""
     lr_normal: float = 1e-3
     lr_footprint: float = 5e-3
     lr_opacity: float = 5e-2
@@ -176,22 +185,38 @@ class ReconstructConfig:
     """Folder to write: capture/ (cameras and points) and run/ (scene and report)."""
     masks: Path | None = None
     """Reflector masks at the size of the photographs: MASKS/REFLECTOR/STEM.png, white = reflector."""
-    warp: Literal["none", "static", "neural"] = "neural"
-    """How reflection points follow the camera; none trains the primary cloud alone."""
+    model: tuple[Model, ...] = ("auto",)
+    """What a reflector is: one name for all, or one for each in order of their names. auto chooses by short trials,
+    none trains the primary cloud alone; concave is an ellipsoid seen from inside."""
     iterations: int = 30_000
     """Optimiser steps at most."""
     minutes: float | None = None
     """Stop training after this much time; schedules then follow time instead of steps."""
     image_size: int = 1000
     """Longer side of the photographs in training."""
-    primary_points: int = 200_000
-    """Primary points at the start, at most."""
-    reflection_points: int = 50_000
-    """Points on each reflection volume."""
+    primary_points: int | None = None
+    """Primary points at the start, at most; left out, it is decided by image size and trials."""
+    reflection_points: int | None = None
+    """Points of each reflector; left out, it is decided by image size and trials."""
     warp_width: int = 256
     """Width of the neural warp's hidden layers (paper: 256); 128 trains twice as many steps a minute on a CPU."""
     seed: int = 0
     device: Literal["auto", "cpu", "cuda"] = "auto"
+
+
+@dataclass(frozen=True)
+class MaskConfig:
+    """Paint the masks of reflectors in the browser, and see at once what volume they make."""
+
+    capture: Path
+    """Folder made by `catacaustics calibrate`."""
+    import_: Path | None = None
+    """Take masks made with any editor, FOLDER/REFLECTOR/STEM.png at the size of the capture's photographs, and exit.
+    They replace all masks of those reflectors; the old ones are kept in removed_masks/."""
+    browser: bool = True
+    """Open the page in the browser; its address is printed in any case."""
+    port: int = 8642
+    """Port on 127.0.0.1; where it is in use, any free one is taken."""
 
 
 @dataclass(frozen=True)

@@ -88,9 +88,9 @@ def compare(
     ssim, flip = ssim_map(render, photo), flip_map(render, photo)
     inside = None
     if mask is not None and mask.any():
-        inside = Metrics(_psnr(render[mask], photo[mask]), float(ssim[mask].mean()), float(flip[mask].mean()))
+        inside = Metrics(psnr(render[mask], photo[mask]), float(ssim[mask].mean()), float(flip[mask].mean()))
     distance = None if lpips_missing() else _lpips(render, photo)
-    return Comparison(Metrics(_psnr(render, photo), float(ssim.mean()), float(flip.mean()), distance), inside, flip)
+    return Comparison(Metrics(psnr(render, photo), float(ssim.mean()), float(flip.mean()), distance), inside, flip)
 
 
 def mean_metrics(values: Sequence[Metrics]) -> Metrics:
@@ -110,7 +110,8 @@ def mean_metrics(values: Sequence[Metrics]) -> Metrics:
     )
 
 
-def _psnr(render: np.ndarray, photo: np.ndarray) -> float:
+def psnr(render: Float[np.ndarray, "*n 3"], photo: Float[np.ndarray, "*n 3"]) -> float:
+    """PSNR in dB over all pixels and channels, at most PSNR_CAP."""
     import torch
     from torchmetrics.functional.image import peak_signal_noise_ratio
 

@@ -7,8 +7,8 @@ from catacaustics.capture.calibrate import calibrate
 from catacaustics.capture.dataset import Capture
 from catacaustics.config import CalibrateConfig, EvaluateConfig, ReconstructConfig, TrainConfig
 from catacaustics.evaluation import evaluate
-from catacaustics.reflectors.volume import build_volume
-from catacaustics.training.loop import train
+from catacaustics.reflectors.volume import build_volume, write_volume
+from catacaustics.training.train import train
 
 
 def reconstruct(config: ReconstructConfig) -> Path:
@@ -30,6 +30,5 @@ def _write_volumes(capture: Capture) -> None:
     """Reflection volumes beside the masks, for viewers and editors; training builds the same ones."""
     for name in capture.reflectors:
         volume = build_volume(capture, name)
-        volume.save(capture.root / "volumes" / f"{name}.json")
-        volume.write_mesh(capture.root / "volumes" / f"{name}.ply")
+        write_volume(capture, volume)
         print(f"volume: {name} has {len(volume.halfspaces)} planes, radius {volume.radius:.4g}")

@@ -19,7 +19,7 @@ from catacaustics.environment import EnvironmentMap
 from catacaustics.errors import UserError
 from catacaustics.files import atomic_path
 from catacaustics.reflectors.volume import ReflectionVolume
-from catacaustics.reflectors.warps import NeuralWarp, StaticWarp
+from catacaustics.reflectors.warps import Displayed, learns_positions, warp_from_state
 from catacaustics.renderer import FEATURES, NeuralRenderer
 from catacaustics.shapes import Float
 from catacaustics.splatting import SplatOutput, points_in_view, splat_points
@@ -31,7 +31,7 @@ class PointParameters(nn.Module):
     """A trainable cloud of oriented disks. Opacities and rho are kept as logits, footprints as logarithms.
 
     Args:
-        positions, normals: (n, 3), trainable only where `trainable_geometry`.
+        positions, normals: (n, 3); reflection points learn no normals, and positions only where `trainable_positions`.
         footprints: (n,) squared radii.
         opacities: (n,) in (0, 1).
         features: (n, 6).
@@ -46,11 +46,11 @@ class PointParameters(nn.Module):
         opacities: Float[Tensor, "n"],
         features: Float[Tensor, "n 6"],
         rho: Float[Tensor, "n"] | None = None,
-        trainable_geometry: bool = True,
+        trainable_positions: bool = True,
     ):
         super().__init__()
-        self.positions = nn.Parameter(positions, requires_grad=trainable_geometry)
-        self.normals = nn.Parameter(normals, requires_grad=trainable_geometry)
+        self.positions = nn.Parameter(positions, requires_grad=trainable_positions)
+        self.normals = nn.Parameter(normals, requires_grad=rho is not None)
         self.log_footprints = nn.Parameter(torch.log(footprints))
         self.opacity_logits = nn.Parameter(torch.logit(opacities))
         self.features = nn.Parameter(features)
@@ -189,8 +189,8 @@ class Scene(nn.Module):
         return output._replace(visible=near[output.visible])
 
     def _splat_reflections(self, camera: Camera, viewport: Viewport, warp_camera: Camera) -> tuple[Tensor, Tensor]:
-        """All reflection clouds over each other, nearer reflectors first. Their disks face the camera: a reflection
-        has a place and a size, but no orientation of its own."""
+        """All reflection clouds over each other, nearer reflectors first. Sources are round; where the warp does not
+        shape their images, disks face the camera."""
         like = self.primary.positions
         image = like.new_zeros(viewport.height, viewport.width, FEATURES)
         through = like.new_ones(viewport.height, viewport.width)
@@ -200,15 +200,21 @@ class Scene(nn.Module):
         for i in np.argsort(distances, kind="stable"):
             cloud, warp = self.reflections[i], self.warps[i]
             with torch.no_grad():
-                displayed = warp(cloud.positions, warp_center)
-                near = points_in_view(displayed, cloud.log_footprints.exp(), camera, viewport, self.splatting)
+                shown = warp(cloud.positions, warp_center)
+                footprints = _stretched(cloud.log_footprints.exp(), shown)
+                near = points_in_view(shown.positions, footprints, camera, viewport, self.splatting)
+                if shown.visible is not None:
+                    near = near[shown.visible[near]]
             # Only points that can land in the viewport are warped with gradients.
             positions, _, log_footprints, logits, features = _rows(cloud, near)
-            positions = warp(positions, warp_center)
+            shown = warp(positions, warp_center)
+            normals = shown.normals
+            if normals is None:
+                normals = torch.nn.functional.normalize(center - shown.positions.detach(), dim=1)
             output = splat_points(
-                positions,
-                torch.nn.functional.normalize(center - positions.detach(), dim=1),
-                log_footprints.exp(),
+                shown.positions,
+                normals,
+                _stretched(log_footprints.exp(), shown),
                 torch.sigmoid(logits),
                 features,
                 camera,
@@ -264,6 +270,10 @@ def _weighted(layers: Layers) -> tuple[Tensor, Tensor]:
     return (1 - rho) * layers.primary, rho * layers.reflection
 
 
+def _stretched(footprints: Tensor, shown: Displayed) -> Tensor:
+    return footprints if shown.stretch is None else footprints * shown.stretch
+
+
 def _rows(cloud: PointParameters, index: Tensor) -> list[Tensor]:
     parts = (cloud.positions, cloud.normals, cloud.log_footprints, cloud.opacity_logits, cloud.features)
     return [t.index_select(0, index) for t in parts]
@@ -294,29 +304,25 @@ def _read_file(path: Path) -> tuple[dict[str, Tensor], dict]:
 def _from_state(state: dict[str, Tensor], volumes: list[ReflectionVolume], splatting: SplatConfig) -> Scene:
     """Build modules of the sizes that the tensors have, then fill them."""
 
-    def cloud(prefix: str, trainable: bool) -> PointParameters:
+    def cloud(prefix: str, trainable_positions: bool = True) -> PointParameters:
         n = len(state[f"{prefix}.positions"])
         half = torch.full((n,), 0.5)
         rho = half.clone() if f"{prefix}.rho_logits" in state else None
         return PointParameters(
-            torch.zeros(n, 3), torch.zeros(n, 3), half, half.clone(), torch.zeros(n, FEATURES), rho, trainable
+            torch.zeros(n, 3), torch.zeros(n, 3), half, half.clone(), torch.zeros(n, FEATURES), rho, trainable_positions
         )
 
-    warps: list[nn.Module] = []
-    for i in range(len(volumes)):
-        first = state.get(f"warps.{i}.network.0.weight")
-        if first is None:
-            warps.append(StaticWarp())
-        else:
-            layers = sum(k.startswith(f"warps.{i}.network.") and k.endswith("weight") for k in state) - 1
-            warps.append(NeuralWarp(torch.zeros(3), torch.ones(3), layers, len(first)))
+    warps = [
+        warp_from_state({k.removeprefix(f"warps.{i}."): v for k, v in state.items() if k.startswith(f"warps.{i}.")})
+        for i in range(len(volumes))
+    ]
     environment = None
     if "environment.features" in state:
         _, height, width = state["environment.features"].shape
         environment = EnvironmentMap(width, height)
     blocks = {k.split(".")[3] for k in state if k.startswith("renderer.decoder.blocks.")}
     renderer = NeuralRenderer(len(state["renderer.decoder.input.bias"]), 1 + 2 * len(blocks))
-    reflections = [cloud(f"reflections.{i}", False) for i in range(len(volumes))]
-    scene = Scene(cloud("primary", True), reflections, warps, volumes, environment, renderer, splatting)
+    reflections = [cloud(f"reflections.{i}", learns_positions(warp)) for i, warp in enumerate(warps)]
+    scene = Scene(cloud("primary"), reflections, warps, volumes, environment, renderer, splatting)
     scene.load_state_dict(state)
     return scene

@@ -18,7 +18,7 @@ from catacaustics.evaluation import evaluate, format_table, reflector_mask
 from catacaustics.reflectors.volume import build_volume
 from catacaustics.run import open_run, read_log
 from catacaustics.scene import Scene
-from catacaustics.training.initialize import initial_scene, primary_seeds, reflection_seeds
+from catacaustics.training.initialize import Reflector, initial_scene, primary_seeds, reflection_seeds
 
 
 @pytest.fixture(scope="module")
@@ -277,8 +277,9 @@ def test_an_interrupted_evaluation_leaves_the_last_one_intact(capture, run, monk
 def test_a_scene_from_its_file_is_evaluated_as_it_was_saved(capture, volume, tmp_path):
     config = TrainConfig(capture.root, tmp_path / "run", primary_points=500, reflection_points=50, environment_width=20)
     rng = np.random.default_rng(0)
-    seeds = [primary_seeds(capture, [volume], config, rng), reflection_seeds(capture, volume, config, rng)]
-    scene = initial_scene(capture, [volume], seeds, 1.0, config)
+    reflector = Reflector(volume, "sphere")
+    seeds = [primary_seeds(capture, [reflector], config, rng), reflection_seeds(capture, reflector, config, rng)]
+    scene = initial_scene(capture, [reflector], seeds, 1.0, config)
     run = make_run(tmp_path / "run", capture)
     scene.save(run / "scene.safetensors")
     result = evaluate(EvaluateConfig(run, device="cpu"))

@@ -11,7 +11,8 @@ from catacaustics.config import TrainConfig
 from catacaustics.errors import UserError
 from catacaustics.reflectors.volume import build_volume
 from catacaustics.scene import Scene
-from catacaustics.training.initialize import initial_scene, primary_seeds, reflection_seeds
+from catacaustics.training.initialize import initial_scene, named_reflectors, primary_seeds, reflection_seeds
+from catacaustics.training.selection import LADDER
 
 
 @pytest.fixture(scope="module")
@@ -20,15 +21,14 @@ def capture(tmp_path_factory):
 
 
 def build(capture, **options):
-    config = TrainConfig(
-        capture.root, capture.root / "run", primary_points=3000, reflection_points=500, environment_width=20, **options
-    )
-    volumes = [build_volume(capture, r) for r in capture.reflectors]
+    settings = {"model": ("neural",), "primary_points": 3000, "reflection_points": 500, "environment_width": 20}
+    config = TrainConfig(capture.root, capture.root / "run", **(settings | options))
+    reflectors = named_reflectors([build_volume(capture, r) for r in capture.reflectors], config.model)
     rng = np.random.default_rng(0)
-    seeds = [primary_seeds(capture, volumes, config, rng)]
-    if config.warp != "none":
-        seeds += [reflection_seeds(capture, v, config, rng) for v in volumes]
-    return initial_scene(capture, volumes, seeds, 1.0, config)
+    seeds = [primary_seeds(capture, reflectors, config, rng)]
+    reflectors = [r for r in reflectors if r.model != "none"]
+    seeds += [reflection_seeds(capture, r, config, rng) for r in reflectors]
+    return initial_scene(capture, reflectors, seeds, 1.0, config)
 
 
 @pytest.fixture(scope="module")
@@ -96,15 +96,15 @@ def test_a_decoupled_warp_camera_changes_reflections_only(capture, scene):
     assert float((a.reflection_rgb - b.reflection_rgb).abs().max()) > 0.01
 
 
-@pytest.mark.parametrize("warp", ["none", "static", "neural"])
-def test_a_saved_scene_renders_the_same(capture, tmp_path, warp):
-    scene = build(capture, warp=warp, warp_width=16, renderer_layers=5)
+@pytest.mark.parametrize("model", ["none", *LADDER[1:]])
+def test_a_saved_scene_renders_the_same(capture, tmp_path, model):
+    scene = build(capture, model=(model,), warp_width=16, renderer_layers=5)
     scene.save(tmp_path / "scene.safetensors")
     loaded = Scene.load(tmp_path / "scene.safetensors")
     camera = toy_cameras(5, 40, 30)[1]
     for a, b in zip(scene.render(camera), loaded.render(camera), strict=True):
         assert torch.equal(a, b)
-    assert [v.name for v in loaded.volumes] == ([] if warp == "none" else ["ball"])
+    assert [v.name for v in loaded.volumes] == ([] if model == "none" else ["ball"])
 
 
 def test_a_file_that_is_missing_cut_off_or_foreign_is_refused(scene, tmp_path):

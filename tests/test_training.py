@@ -24,6 +24,7 @@ from catacaustics.training.initialize import (
     start_cloud,
 )
 from catacaustics.training.optimizer import RowAdam, make_optimizer
+from catacaustics.training.train import train
 
 
 @pytest.fixture(scope="module")
@@ -33,6 +34,7 @@ def capture_path(tmp_path_factory):
 
 def small(capture_path, run, **options):
     settings = {
+        "model": ("neural",),
         "iterations": 60,
         "primary_points": 2500,
         "reflection_points": 300,
@@ -46,7 +48,7 @@ def small(capture_path, run, **options):
 
 
 def test_training_learns_the_scene_and_writes_its_files(capture_path, tmp_path):
-    scene = loop.train(small(capture_path, tmp_path / "run", iterations=150))
+    scene = train(small(capture_path, tmp_path / "run", iterations=150))
     rows = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
     assert [r["step"] for r in rows] == list(range(10, 151, 10))
     assert rows[0]["scale"] < 1.0
@@ -66,7 +68,7 @@ def test_training_learns_the_scene_and_writes_its_files(capture_path, tmp_path):
 
 
 def test_resuming_continues_exactly_as_if_never_interrupted(capture_path, tmp_path, monkeypatch, capsys):
-    whole = loop.train(small(capture_path, tmp_path / "whole"))
+    whole = train(small(capture_path, tmp_path / "whole"))
     real_step, calls = loop._step, []
 
     def interrupted(*arguments):
@@ -78,31 +80,31 @@ def test_resuming_continues_exactly_as_if_never_interrupted(capture_path, tmp_pa
     config = small(capture_path, tmp_path / "parts")
     monkeypatch.setattr(loop, "_step", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        loop.train(config)
+        train(config)
     assert "interrupted at step 37" in capsys.readouterr().out
     monkeypatch.setattr(loop, "_step", real_step)
-    parts = loop.train(replace(config, resume=True))
+    parts = train(replace(config, resume=True))
     for (name, a), (_, b) in zip(whole.named_parameters(), parts.named_parameters(), strict=True):
         assert torch.equal(a, b), name
     rows = (tmp_path / "parts" / "metrics.jsonl").read_text().splitlines()
     assert [json.loads(r)["step"] for r in rows] == list(range(10, 61, 10))
     capsys.readouterr()
-    loop.train(replace(config, resume=True))
+    train(replace(config, resume=True))
     assert "finished already" in capsys.readouterr().out
 
 
 def test_a_run_is_never_overwritten_by_accident(capture_path, tmp_path):
     config = small(capture_path, tmp_path / "run", iterations=3)
-    loop.train(config)
+    train(config)
     before = (tmp_path / "run" / "scene.safetensors").read_bytes()
     with pytest.raises(UserError, match="already holds a run"):
-        loop.train(config)
+        train(config)
     assert (tmp_path / "run" / "scene.safetensors").read_bytes() == before
 
 
 def test_without_masks_the_primary_cloud_is_trained_alone_and_this_is_said(tmp_path, capsys):
     capture = make_toy_capture(tmp_path / "capture", masks=False)
-    scene = loop.train(small(capture, tmp_path / "run", iterations=5))
+    scene = train(small(capture, tmp_path / "run", iterations=5))
     assert "no reflector" in capsys.readouterr().out
     assert len(scene.reflections) == 0
 
@@ -118,7 +120,7 @@ def test_a_loss_that_is_not_finite_stops_training_and_keeps_the_last_checkpoint(
 
     monkeypatch.setattr(loop, "dssim", poisoned)
     with pytest.raises(UserError, match="loss is not finite at step 6"):
-        loop.train(config)
+        train(config)
     _, _, notes = Scene.load_with_extras(tmp_path / "run" / "checkpoint.safetensors")
     assert notes["step"] == 6
 
@@ -126,7 +128,7 @@ def test_a_loss_that_is_not_finite_stops_training_and_keeps_the_last_checkpoint(
 def test_a_time_budget_ends_training_and_drives_its_stages(capture_path, tmp_path, monkeypatch):
     ticks = itertools.count()
     monkeypatch.setattr(loop, "time", SimpleNamespace(monotonic=lambda: 0.25 * next(ticks)))  # half a second a step
-    loop.train(small(capture_path, tmp_path / "run", iterations=10**6, minutes=1.0))
+    train(small(capture_path, tmp_path / "run", iterations=10**6, minutes=1.0))
     rows = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
     assert 55 < rows[-1]["seconds"] <= 61
     # The first row is written after 5 of 60 seconds, past the end of the first stage but not of the second.
@@ -180,7 +182,7 @@ def test_rows_follow_adam_and_stand_still_while_they_have_no_gradient():
 
 
 def test_densification_spawns_downhill_keeps_moments_and_respects_the_cap(capture_path, tmp_path):
-    scene = loop.train(small(capture_path, tmp_path / "run", iterations=4, densify_every=0))
+    scene = train(small(capture_path, tmp_path / "run", iterations=4, densify_every=0))
     optimizer = make_optimizer(scene, small(capture_path, tmp_path))
     n = len(scene.primary)
     for group in optimizer.param_groups:

@@ -5,6 +5,7 @@ Each mask's convex hull, lifted through its camera, is a pyramid; the volume is 
 pictures lie inside the masks.
 """
 
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -12,7 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from catacaustics.cameras import Camera, Viewport
-from catacaustics.capture.dataset import Capture
+from catacaustics.capture.dataset import Capture, View
 from catacaustics.errors import UserError
 from catacaustics.files import read_json, write_bytes, write_json
 from catacaustics.geometry import (
@@ -27,6 +28,18 @@ from catacaustics.shapes import Bool, Float, Int
 
 _SMALLEST = 1e-6
 """Inscribed radius, in units of the cameras' spread, below which an intersection counts as empty."""
+
+
+class MaskError(UserError):
+    """Masks that make no volume.
+
+    Args:
+        views: names of the views to look at.
+    """
+
+    def __init__(self, found: str, expected: str, remedy: str, views: Sequence[str] = ()):
+        self.views = tuple(views)
+        super().__init__(found, expected, remedy)
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,10 +61,11 @@ class ReflectionVolume:
     def contains(self, points: Float[np.ndarray, "*n 3"]) -> Bool[np.ndarray, "*n"]:
         """Whether points lie inside or on the surface (to 1e-7 of the radius)."""
         flat = points.reshape(-1, 3)
-        inside = np.ones(len(flat), bool)
+        inside = np.linalg.norm(flat - self.center, axis=-1) <= (1 + 1e-6) * self.radius
+        near = np.flatnonzero(inside)
         normals, limits = self.halfspaces[:, :3], 1e-7 * self.radius - self.halfspaces[:, 3]
-        for start in range(0, len(flat), 4096):  # thousands of half-spaces times points would not fit in memory
-            block = slice(start, start + 4096)
+        for start in range(0, len(near), 4096):  # thousands of half-spaces times points would not fit in memory
+            block = near[start : start + 4096]
             inside[block] = (flat[block] @ normals.T <= limits).all(-1)
         return inside.reshape(points.shape[:-1])
 
@@ -96,8 +110,25 @@ class ReflectionVolume:
         view = viewport or camera.viewport
         if self.contains(camera.center[None])[0]:
             return np.ones((view.height, view.width), bool)
-        polygon = _projected_polygon(self, camera)
+        polygon = self.outline(camera)
         return _fill_convex(polygon - [view.x0, view.y0], view.width, view.height)
+
+    def outline(self, camera: Camera) -> Float[np.ndarray, "n 2"]:
+        """Outline in pixels (counter-clockwise corners) of the part in front of the camera; (0, 2) where nothing is.
+        It may reach far outside the image."""
+        from scipy.spatial import ConvexHull
+
+        points = transform(camera.camera_from_world, self.vertices)
+        near = 1e-6 * self.radius
+        edges = points[self.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)]
+        crossing = edges[(edges[:, 0, 2] > near) & (edges[:, 1, 2] <= near)]
+        t = (crossing[:, 0, 2] - near) / (crossing[:, 0, 2] - crossing[:, 1, 2])
+        cut = crossing[:, 0] + t[:, None] * (crossing[:, 1] - crossing[:, 0])
+        seen = np.concatenate([points[points[:, 2] > near], cut])
+        if not len(seen):
+            return np.zeros((0, 2))
+        pixels = seen[:, :2] / seen[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+        return pixels[ConvexHull(pixels).vertices]
 
     def save(self, path: Path) -> None:
         """Write as JSON."""
@@ -131,23 +162,6 @@ class ReflectionVolume:
         buffer = io.BytesIO()
         PlyData([PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]).write(buffer)
         write_bytes(path, buffer.getvalue())
-
-
-def _projected_polygon(volume: ReflectionVolume, camera: Camera) -> np.ndarray:
-    """Outline in pixels (counter-clockwise corners) of the part in front of the camera; (0, 2) where nothing is."""
-    from scipy.spatial import ConvexHull
-
-    points = transform(camera.camera_from_world, volume.vertices)
-    near = 1e-6 * volume.radius
-    edges = points[volume.faces[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)]
-    crossing = edges[(edges[:, 0, 2] > near) & (edges[:, 1, 2] <= near)]
-    t = (crossing[:, 0, 2] - near) / (crossing[:, 0, 2] - crossing[:, 1, 2])
-    cut = crossing[:, 0] + t[:, None] * (crossing[:, 1] - crossing[:, 0])
-    seen = np.concatenate([points[points[:, 2] > near], cut])
-    if not len(seen):
-        return np.zeros((0, 2))
-    pixels = seen[:, :2] / seen[:, 2:] * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-    return pixels[ConvexHull(pixels).vertices]
 
 
 def _fill_convex(polygon: np.ndarray, width: int, height: int) -> np.ndarray:
@@ -242,7 +256,9 @@ def lift_halfplanes(camera: Camera, halfplanes: Float[np.ndarray, "m 3"]) -> Flo
 
 def _check_mask(name: str, camera: Camera, mask: np.ndarray, view: str) -> None:
     def refuse(found: str, remedy: str) -> None:
-        raise UserError(f"The mask of {name} in view {view} {found}.", "a mask that outlines the object", remedy)
+        raise MaskError(
+            f"The mask of {name} in view {view} {found}.", "a mask that outlines the object", remedy, [view]
+        )
 
     if mask.shape != (camera.height, camera.width):
         size = f"{mask.shape[1]} x {mask.shape[0]} pixels, its photograph {camera.width} x {camera.height}"
@@ -297,11 +313,11 @@ def volume_from_masks(
         tolerance: of the outline's simplification, in pixels.
 
     Raises:
-        UserError: a mask is unusable, the masks contradict each other, or they leave the volume open; the message
+        MaskError: a mask is unusable, the masks contradict each other, or they leave the volume open; the message
             names the views to repaint.
     """
     if not masks:
-        raise UserError(
+        raise MaskError(
             f"The reflector {name} has no masks.", "masks in 3 or 4 views", "paint them in the mask painter"
         )
     views = [view for view, _, _ in masks]
@@ -319,19 +335,22 @@ def volume_from_masks(
 
     inside, radius = chebyshev_center(planes)
     if radius <= _SMALLEST:
-        raise UserError(
+        blamed = _conflicting(views, groups)
+        raise MaskError(
             f"The masks of {name} contradict each other: no point in space is inside all {len(masks)}.",
             "masks of the same object, around all of it, and correctly calibrated views",
-            f"repaint or delete the masks of {_listed(_conflicting(views, groups))}",
+            f"repaint or delete the masks of {_listed(blamed)}",
+            blamed,
         )
     bounded = np.isfinite(radius) and is_bounded(planes[:, :3])
     vertices, active = intersect_halfspaces(planes, inside) if bounded else (np.full((1, 3), np.inf), np.arange(0))
     if np.abs(vertices).max() > 1e4:
-        raise UserError(
+        raise MaskError(
             f"The masks of {name} leave its volume open: the object could reach to infinity as seen from "
             f"{_listed(views)}.",
             "masks in 3 or 4 views from clearly different directions, clear of the image border in most",
             f"paint {name} in another view, from the side of those{_border_hint(views, masks)}",
+            views,
         )
     vertices, faces = hull_mesh(vertices * scale + origin)
     kept = planes[active]
@@ -344,17 +363,27 @@ def _border_hint(views: list[str], masks: list[tuple[str, Camera, np.ndarray]]) 
     return f"; the masks of {_listed(touching)} touch the image border and are open there" if touching else ""
 
 
+def volume_views(capture: Capture, masked: Collection[str]) -> list[View]:
+    """Of the views with these names, those whose masks make a volume: the training views, or all where fewer than 3
+    training views are among them."""
+    chosen = [v for v in capture.train if v.name in masked]
+    return chosen if len(chosen) >= 3 else [v for v in capture.views if v.name in masked]
+
+
 def build_volume(capture: Capture, reflector: str) -> ReflectionVolume:
-    """The volume of one of a capture's reflectors, from its masks in training views (in all views where fewer than 3
-    training views have one); raises as `volume_from_masks`."""
+    """The volume of one of a capture's reflectors, from its masks in `volume_views`; raises as `volume_from_masks`."""
     if reflector not in capture.reflectors:
         raise UserError(
             f"The capture {capture.root} has no masks of a reflector {reflector}.",
             f"one of: {', '.join(capture.reflectors) or 'none yet'}",
-            f"paint masks into {capture.root / 'masks' / reflector}",
+            f"paint masks: `catacaustics mask {capture.root}`",
         )
-    masked = [v for v in capture.train if capture.mask_path(v, reflector).is_file()]
-    if len(masked) < 3:
-        masked = capture.views
-    masks = [(v.name, v.camera, capture.mask(v, reflector)) for v in masked]
+    masked = {v.name for v in capture.views if capture.mask_path(v, reflector).is_file()}
+    masks = [(v.name, v.camera, capture.mask(v, reflector)) for v in volume_views(capture, masked)]
     return volume_from_masks(reflector, [(name, camera, mask) for name, camera, mask in masks if mask is not None])
+
+
+def write_volume(capture: Capture, volume: ReflectionVolume) -> None:
+    """Write a volume beside the masks, for viewers and editors: volumes/NAME.json and .ply."""
+    volume.save(capture.root / "volumes" / f"{volume.name}.json")
+    volume.write_mesh(capture.root / "volumes" / f"{volume.name}.ply")

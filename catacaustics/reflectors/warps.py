@@ -1,21 +1,105 @@
-"""Warps: where a reflection point is displayed for a camera centre (paper section 4).
+"""Warps: where a reflection point is displayed for a camera centre. A ladder, from no motion to optics to a network.
 
-Every warp is a module with forward(positions (n, 3), center (3,)) -> displayed positions (n, 3).
+Every warp is a module with forward(points (n, 3), center (3,)) -> Displayed. What the points are depends on the rung:
+of `plane` and the quadrics they are the world positions of what is mirrored, of the others positions where it is seen.
 """
 
 import itertools
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from catacaustics.shapes import Float
+from catacaustics.reflectors.quadric import specular_points, tilted_disks
+from catacaustics.shapes import Bool, Float
+
+
+class Displayed(NamedTuple):
+    """Where points appear. `normals` None: disks face the camera; `stretch` multiplies squared radii (the footprint's
+    Jacobian, no gradients); points that are not `visible` are not drawn."""
+
+    positions: Float[Tensor, "n 3"]
+    normals: Float[Tensor, "n 3"] | None = None
+    stretch: Float[Tensor, "n"] | None = None
+    visible: Bool[Tensor, "n"] | None = None
 
 
 class StaticWarp(nn.Module):
-    """p' = p: flat mirrors and painted-on highlights, whose image does not move with the camera."""
+    """p' = p: painted-on highlights, and flat mirrors, whose image does not move with the camera."""
 
-    def forward(self, positions: Float[Tensor, "n 3"], center: Float[Tensor, "3"]) -> Float[Tensor, "n 3"]:
-        return positions
+    def forward(self, points: Float[Tensor, "n 3"], center: Float[Tensor, "3"]) -> Displayed:
+        return Displayed(points)
+
+
+class PlaneWarp(nn.Module):
+    """p' = mirror image of a world point in a learned plane, seen where camera and point are on its front side.
+
+    Args:
+        point, normal: (3,) of the plane at the start; the normal points to the front.
+        scale: length in which the plane's offset is learned.
+    """
+
+    def __init__(self, point: Float[Tensor, "3"], normal: Float[Tensor, "3"], scale: float):
+        super().__init__()
+        self.register_buffer("start_point", point)
+        self.register_buffer("start_normal", torch.nn.functional.normalize(normal, dim=0))
+        self.register_buffer("scale", torch.as_tensor(float(scale)))
+        self.tilt = nn.Parameter(torch.zeros(3))
+        self.offset = nn.Parameter(torch.zeros(()))
+
+    def plane(self) -> tuple[Float[Tensor, "3"], Float[Tensor, ""]]:
+        """Unit normal n and distance d of the plane n . x = d."""
+        normal = torch.nn.functional.normalize(self.start_normal + self.tilt, dim=0)
+        return normal, normal @ self.start_point + self.offset * self.scale
+
+    def forward(self, points: Float[Tensor, "n 3"], center: Float[Tensor, "3"]) -> Displayed:
+        normal, distance = self.plane()
+        height = points @ normal - distance
+        visible = (height > 0) & (center @ normal > distance)
+        return Displayed(points - 2 * height[:, None] * normal, visible=visible)
+
+
+class QuadricWarp(nn.Module):
+    """The image of a world point in a learned sphere or ellipsoid (reflectors/quadric.py), on the ray at the length of
+    the path, so that nearer mirrored points hide farther ones. Its disk has the shape that the mirror gives it.
+
+    Args:
+        center: (3,) at the start.
+        axes: (3, 3), half-axes in columns, at the start.
+        sphere: the three radii stay equal.
+        concave: the inner side mirrors.
+    """
+
+    def __init__(self, center: Float[Tensor, "3"], axes: Float[Tensor, "3 3"], sphere: bool, concave: bool = False):
+        super().__init__()
+        self.register_buffer("start_center", center)
+        self.register_buffer("start_axes", axes)
+        self.register_buffer("concave", torch.tensor(concave))
+        # In units of the mean radius and of radians: one learning rate fits all.
+        self.shift = nn.Parameter(torch.zeros(3))
+        self.log_radii = nn.Parameter(torch.zeros(1 if sphere else 3))
+        self.turn = None if sphere else nn.Parameter(torch.zeros(3))
+
+    def shape(self) -> tuple[Float[Tensor, "3"], Float[Tensor, "3 3"]]:
+        """Centre, and half-axes in columns."""
+        center = self.start_center + self.shift * self.start_axes.norm(dim=0).mean()
+        axes = self.start_axes * self.log_radii.exp()
+        if self.turn is not None:
+            x, y, z = self.turn.unbind()
+            zero = torch.zeros_like(x)
+            cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3)
+            axes = torch.linalg.matrix_exp(cross) @ axes
+        return center, axes
+
+    def forward(self, points: Float[Tensor, "n 3"], center: Float[Tensor, "3"]) -> Displayed:
+        middle, axes = self.shape()
+        found = specular_points(points, center, middle, axes, bool(self.concave))
+        ray = found.points - center
+        near = ray.norm(dim=1, keepdim=True).clamp_min(1e-12)
+        direction = ray / near
+        length = near + (points - found.points).norm(dim=1, keepdim=True)
+        normals, stretch = tilted_disks(found.jacobian, -direction.detach())
+        return Displayed(center + length * direction, normals, stretch, found.visible)
 
 
 class NeuralWarp(nn.Module):
@@ -35,8 +119,49 @@ class NeuralWarp(nn.Module):
         hidden = [m for a, b in itertools.pairwise(sizes) for m in (nn.Linear(a, b), nn.ReLU())]
         self.network = nn.Sequential(*hidden, nn.Linear(width, 3))
 
-    def forward(self, positions: Float[Tensor, "n 3"], center: Float[Tensor, "3"]) -> Float[Tensor, "n 3"]:
-        p = (positions - self.middle) / self.half_size
+    def forward(self, points: Float[Tensor, "n 3"], center: Float[Tensor, "3"]) -> Displayed:
+        p = (points - self.middle) / self.half_size
         c = ((center - self.middle) / self.half_size).expand_as(p)
         # Scaled so that training starts with almost no motion.
-        return positions + 0.01 * self.half_size * self.network(torch.cat([p, c], -1))
+        return Displayed(points + 0.01 * self.half_size * self.network(torch.cat([p, c], -1)))
+
+
+class QuadricNeuralWarp(nn.Module):
+    """Physics first, a network for what the quadric misses: p' = q + F(q, c), q the quadric's image of the point."""
+
+    def __init__(self, quadric: QuadricWarp, neural: NeuralWarp):
+        super().__init__()
+        self.quadric = quadric
+        self.neural = neural
+
+    def forward(self, points: Float[Tensor, "n 3"], center: Float[Tensor, "3"]) -> Displayed:
+        image = self.quadric(points, center)
+        return image._replace(positions=self.neural(image.positions, center).positions)
+
+
+def learns_positions(warp: nn.Module) -> bool:
+    """Whether a cloud's points move in training: the network alone displaces points that stay fixed (paper 4.2)."""
+    return not isinstance(warp, NeuralWarp)
+
+
+def warp_from_state(state: dict[str, Tensor]) -> nn.Module:
+    """The warp that a state dictionary belongs to, filled."""
+    if "quadric.start_axes" in state:
+        parts = {
+            part: warp_from_state({k.removeprefix(f"{part}."): v for k, v in state.items() if k.startswith(f"{part}.")})
+            for part in ("quadric", "neural")
+        }
+        return QuadricNeuralWarp(**parts)
+    if "start_axes" in state:
+        sphere = len(state["log_radii"]) == 1
+        warp: nn.Module = QuadricWarp(state["start_center"], state["start_axes"], sphere, bool(state["concave"]))
+    elif "start_point" in state:
+        warp = PlaneWarp(state["start_point"], state["start_normal"], float(state["scale"]))
+    elif "network.0.weight" in state:
+        layers = sum(k.startswith("network.") and k.endswith("weight") for k in state) - 1
+        width = len(state["network.0.weight"])
+        warp = NeuralWarp(torch.zeros(3), torch.ones(3), layers, width)
+    else:
+        return StaticWarp()
+    warp.load_state_dict(state)
+    return warp

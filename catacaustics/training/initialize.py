@@ -9,11 +9,21 @@ from torch import nn
 from catacaustics.capture.dataset import Capture
 from catacaustics.config import SplatConfig, TrainConfig
 from catacaustics.environment import EnvironmentMap
+from catacaustics.errors import UserError
+from catacaustics.reflectors.fit import fit_ellipsoid, fit_plane, fit_sphere, surroundings
 from catacaustics.reflectors.volume import ReflectionVolume
-from catacaustics.reflectors.warps import NeuralWarp, StaticWarp
+from catacaustics.reflectors.warps import (
+    NeuralWarp,
+    PlaneWarp,
+    QuadricNeuralWarp,
+    QuadricWarp,
+    StaticWarp,
+    learns_positions,
+)
 from catacaustics.renderer import FEATURES, NeuralRenderer
 from catacaustics.scene import PointParameters, Scene
 from catacaustics.shapes import Float
+from catacaustics.training.photographs import scaled_camera
 
 INITIAL_OPACITY = 0.8
 _SURFACE_SHARE = 0.3
@@ -27,6 +37,29 @@ class Seeds(NamedTuple):
     normals: Float[np.ndarray, "n 3"]
     colors: Float[np.ndarray, "n 3"]
     rho: Float[np.ndarray, "n"]
+
+
+class Reflector(NamedTuple):
+    """A reflection volume and the rung of the ladder that models it (config.Model, but not auto)."""
+
+    volume: ReflectionVolume
+    model: str
+
+
+def named_reflectors(volumes: list[ReflectionVolume], models: tuple[str, ...]) -> list[Reflector]:
+    """Each volume with its model: one name counts for all.
+
+    Raises:
+        UserError: the number of names is neither 1 nor that of the volumes.
+    """
+    if len(models) not in (1, len(volumes)) and volumes:
+        raise UserError(
+            f"{len(models)} models are named for {len(volumes)} reflectors.",
+            "one for all, or one for each of " + ", ".join(v.name for v in volumes),
+            "change --model",
+        )
+    names = models * len(volumes) if len(models) == 1 else models
+    return [Reflector(volume, name) for volume, name in zip(volumes, names, strict=False)]
 
 
 def scene_extent(capture: Capture) -> float:
@@ -51,6 +84,18 @@ def neighbor_footprints(positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray
     return np.clip(squared, 1e-4 * median + 1e-16, 16 * median).astype(np.float32)
 
 
+def usual_points(capture: Capture, volumes: list[ReflectionVolume], config: TrainConfig) -> dict[str, int]:
+    """Points that images of the training's size deserve: 1.3 primary points a pixel of one image, 2 reflection points a
+    pixel of the largest reflector (medians over the views). Measured on path-traced rooms; more brings little."""
+    cameras = [scaled_camera(v.camera, config.image_size, 1.0) for v in capture.train]
+    pixels = float(np.median([c.width * c.height for c in cameras]))
+    areas = [np.median([v.project_mask(c).sum() for c in cameras[:: max(1, len(cameras) // 9)]]) for v in volumes]
+    return {
+        "primary_points": int(np.clip(1.3 * pixels, 1000, config.max_primary_points)),
+        "reflection_points": int(np.clip(2 * max(areas, default=0), 500, 400_000)),
+    }
+
+
 def mean_reflector_color(capture: Capture, volume: ReflectionVolume) -> Float[np.ndarray, "3"]:
     """Mean colour inside the projected volume over a few training views."""
     pixels = []
@@ -62,24 +107,24 @@ def mean_reflector_color(capture: Capture, volume: ReflectionVolume) -> Float[np
 
 
 def primary_seeds(
-    capture: Capture, volumes: list[ReflectionVolume], config: TrainConfig, rng: np.random.Generator
+    capture: Capture, reflectors: list[Reflector], config: TrainConfig, rng: np.random.Generator
 ) -> Seeds:
     """Stereo points outside the reflectors, and points on the reflectors' surfaces, which carry rho, in random order.
 
     Stereo has no points on a mirror, but something must hide what is behind it.
     """
     cloud = capture.points()
-    for volume in volumes:
+    for volume, _ in reflectors:
         cloud = cloud.select(~volume.contains(cloud.positions.astype(np.float64)))
     if len(cloud) > config.primary_points:
         cloud = cloud.select(rng.choice(len(cloud), config.primary_points, replace=False))
     spacing2 = 2 * float(np.median(neighbor_footprints(cloud.positions))) if len(cloud) > 1 else 1e-4
     budget = int(_SURFACE_SHARE * config.primary_points)
-    wanted = [int(v.area / spacing2) + 1 for v in volumes]
+    wanted = [int(volume.area / spacing2) + 1 for volume, _ in reflectors]
     shrink = min(1.0, budget / max(sum(wanted), 1))
-    rho = 0.02 if config.warp == "none" else 0.9
     parts = [(cloud.positions, cloud.normals, cloud.colors, np.full(len(cloud), 0.02))]
-    for volume, n in zip(volumes, wanted, strict=True):
+    for (volume, model), n in zip(reflectors, wanted, strict=True):
+        rho = 0.02 if model == "none" else 0.9
         positions, normals = volume.sample_surface(max(int(n * shrink), 100), rng)
         color = mean_reflector_color(capture, volume)
         parts.append((positions, normals, np.broadcast_to(color, positions.shape), np.full(len(positions), rho)))
@@ -88,18 +133,27 @@ def primary_seeds(
     return Seeds(*(c[order] for c in columns))
 
 
-def reflection_seeds(
-    capture: Capture, volume: ReflectionVolume, config: TrainConfig, rng: np.random.Generator
-) -> Seeds:
-    """Random points on the surface of a reflection volume (paper section 4.2)."""
-    positions, normals = volume.sample_surface(config.reflection_points, rng)
-    color = np.broadcast_to(mean_reflector_color(capture, volume), positions.shape)
-    columns = (positions, normals, color, np.zeros(len(positions)))
+def reflection_seeds(capture: Capture, reflector: Reflector, config: TrainConfig, rng: np.random.Generator) -> Seeds:
+    """Where reflection points start: for mirrors, on what the capture knows of the surroundings, evenly spread over
+    directions; otherwise at random on the surface of the reflection volume (paper section 4.2)."""
+    volume, model = reflector
+    color = mean_reflector_color(capture, volume)
+    if model in ("static", "neural"):
+        positions, normals = volume.sample_surface(config.reflection_points, rng)
+        colors = np.broadcast_to(color, positions.shape)
+    else:
+        cloud = capture.points()
+        far = 2 * max(float(np.linalg.norm(v.camera.center - volume.center)) for v in capture.train)
+        positions, colors = surroundings(
+            cloud.positions.astype(np.float64), cloud.colors, volume, config.reflection_points, far, color, rng
+        )
+        normals = np.zeros_like(positions)
+    columns = (positions, normals, colors, np.zeros(len(positions)))
     return Seeds(*(np.ascontiguousarray(c, np.float32) for c in columns))
 
 
-def start_cloud(seeds: Seeds, count: int, primary: bool) -> PointParameters:
-    """The first `count` seeds as trainable points."""
+def start_cloud(seeds: Seeds, count: int, primary: bool, trainable_positions: bool = True) -> PointParameters:
+    """The first `count` seeds as trainable points; only primary points carry rho."""
     positions = seeds.positions[:count]
     features = torch.zeros(len(positions), FEATURES)
     features[:, :3] = torch.from_numpy(seeds.colors[:count])
@@ -110,7 +164,7 @@ def start_cloud(seeds: Seeds, count: int, primary: bool) -> PointParameters:
         torch.full((len(positions),), INITIAL_OPACITY),
         features,
         torch.from_numpy(seeds.rho[:count].copy()) if primary else None,
-        trainable_geometry=primary,
+        trainable_positions,
     )
 
 
@@ -123,42 +177,61 @@ def grow_cloud(cloud: PointParameters, seeds: Seeds, count: int) -> PointParamet
     if count <= old:
         return cloud
     device = cloud.positions.device
-    grown = start_cloud(seeds, count, cloud.rho_logits is not None).to(device)
-    before = start_cloud(seeds, old, cloud.rho_logits is not None).to(device)
+    kind = (cloud.rho_logits is not None, cloud.positions.requires_grad)
+    grown = start_cloud(seeds, count, *kind).to(device)
+    before = start_cloud(seeds, old, *kind).to(device)
     nearest = cKDTree(seeds.positions[:old]).query(seeds.positions[old:count])[1]
     source = torch.cat([torch.arange(old), torch.from_numpy(nearest)]).to(device)
     with torch.no_grad():
         for name, parameter in grown.named_parameters():
             learned, start = cloud.get_parameter(name), before.get_parameter(name)
-            if parameter.requires_grad and name not in ("positions", "normals"):
+            if parameter.requires_grad:
                 parameter += (learned - start)[source]
     return grown
 
 
-def make_warp(config: TrainConfig, capture: Capture, volume: ReflectionVolume) -> nn.Module:
-    if config.warp == "static":
+def make_warp(config: TrainConfig, capture: Capture, reflector: Reflector) -> nn.Module:
+    """The warp of a reflector's model, started from its volume."""
+    volume, model = reflector
+
+    def tensors(*arrays: np.ndarray) -> list[torch.Tensor]:
+        return [torch.from_numpy(np.asarray(a, np.float32)) for a in arrays]
+
+    centers = np.array([v.camera.center for v in capture.train])
+    if model == "static":
         return StaticWarp()
-    corners = np.concatenate([volume.vertices, [v.camera.center for v in capture.train]])
-    low, high = (torch.from_numpy(c.astype(np.float32)) for c in (corners.min(0), corners.max(0)))
-    return NeuralWarp(low, high, config.warp_layers, config.warp_width)
+    if model == "plane":
+        return PlaneWarp(*tensors(*fit_plane(volume, centers)), volume.radius)
+    if model == "sphere":
+        center, radius = fit_sphere(volume)
+        return QuadricWarp(*tensors(center, radius * np.eye(3)), sphere=True)
+    if model in ("ellipsoid", "concave"):
+        return QuadricWarp(*tensors(*fit_ellipsoid(volume)), sphere=False, concave=model == "concave")
+    corners = np.concatenate([volume.vertices, centers])
+    neural = NeuralWarp(*tensors(corners.min(0), corners.max(0)), config.warp_layers, config.warp_width)
+    if model == "neural":
+        return neural
+    return QuadricNeuralWarp(QuadricWarp(*tensors(*fit_ellipsoid(volume)), sphere=False), neural)
 
 
 def initial_scene(
-    capture: Capture, volumes: list[ReflectionVolume], seeds: list[Seeds], share: float, config: TrainConfig
+    capture: Capture, reflectors: list[Reflector], seeds: list[Seeds], share: float, config: TrainConfig
 ) -> Scene:
     """A scene with the first `share` of every cloud's seeds: seeds[0] primary, then one per reflector."""
     torch.manual_seed(config.seed)
-    counts = [stage_count(s, share) for s in seeds]
-    primary = start_cloud(seeds[0], counts[0], primary=True)
+    primary = start_cloud(seeds[0], stage_count(seeds[0], share), primary=True)
     environment = None
     if config.environment_width:
         environment = EnvironmentMap(config.environment_width, max(1, round(0.4 * config.environment_width)))
     renderer = NeuralRenderer(config.renderer_width, config.renderer_layers)
-    reflective = [] if config.warp == "none" else volumes
-    clouds = [start_cloud(s, n, primary=False) for s, n in zip(seeds[1:], counts[1:], strict=True)]
-    warps = [make_warp(config, capture, v) for v in reflective]
+    warps = [make_warp(config, capture, r) for r in reflectors]
+    clouds = [
+        start_cloud(s, stage_count(s, share), False, learns_positions(warp))
+        for s, warp in zip(seeds[1:], warps, strict=True)
+    ]
+    volumes = [r.volume for r in reflectors]
     near = 1e-2 * scene_extent(capture)
-    return Scene(primary, clouds, warps, reflective, environment, renderer, SplatConfig(near=near, alpha_min=1 / 255))
+    return Scene(primary, clouds, warps, volumes, environment, renderer, SplatConfig(near=near, alpha_min=1 / 255))
 
 
 def stage_count(seeds: Seeds, share: float) -> int:

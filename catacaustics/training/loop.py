@@ -2,7 +2,7 @@
 
 import json
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,15 +11,15 @@ import torch
 from torch import Tensor
 from tqdm import tqdm
 
-from catacaustics.capture.dataset import Capture, open_capture
+from catacaustics.capture.dataset import Capture
 from catacaustics.config import TrainConfig
 from catacaustics.errors import UserError
-from catacaustics.files import write_json
 from catacaustics.losses import coverage_loss, dssim, total_variation, weight_loss
-from catacaustics.reflectors.volume import ReflectionVolume, build_volume
+from catacaustics.reflectors.volume import ReflectionVolume
 from catacaustics.scene import Layers, Scene
 from catacaustics.training.densification import GradientStatistics, densify
 from catacaustics.training.initialize import (
+    Reflector,
     Seeds,
     grow_cloud,
     initial_scene,
@@ -27,6 +27,7 @@ from catacaustics.training.initialize import (
     reflection_seeds,
     scene_extent,
     stage_count,
+    usual_points,
 )
 from catacaustics.training.optimizer import RowAdam, make_optimizer, optimizer_tensors, restore_optimizer, set_rates
 from catacaustics.training.photographs import PhotographCache, choose_patch, scaled_camera
@@ -58,65 +59,54 @@ class TrainState:
     seconds: float = 0.0
     stage: int = 0
     queue: list[int] = field(default_factory=list)
+    gradient_norm: float = 0.0
 
 
-def train(config: TrainConfig) -> Scene:
-    """Train a scene; writes RUN/scene.safetensors and keeps RUN/checkpoint.safetensors while at it.
+def fit(capture: Capture, reflectors: list[Reflector], config: TrainConfig) -> Scene:
+    """Train a scene of known models; writes RUN/scene.safetensors and keeps RUN/checkpoint.safetensors while at it.
 
     Raises:
-        UserError: no capture, no volume, an unfinished run without --resume, or a value that is not finite.
+        UserError: a value that is not finite.
         KeyboardInterrupt: after the checkpoint was saved.
     """
     run = Path(config.run)
-    capture = open_capture(config.capture)
-    finished = run / "scene.safetensors"
-    if finished.exists() and config.resume:
-        print(f"training: {finished} is finished already, kept")
-        return Scene.load(finished, _device(config))
-    if not config.resume and (finished.exists() or (run / "checkpoint.safetensors").exists()):
-        raise UserError(
-            f"{run} already holds a run.", "an empty folder", "add --resume to go on, or choose another folder"
-        )
-    volumes = [build_volume(capture, name) for name in capture.reflectors]
-    if not volumes:
-        print("training: the capture has no masks, so no reflector; the primary cloud is trained alone")
     rng = np.random.default_rng(config.seed)
-    seeds = [primary_seeds(capture, volumes, config, rng)]
-    if config.warp != "none":
-        seeds += [reflection_seeds(capture, v, config, rng) for v in volumes]
-    settings = asdict(config) | {"capture": str(Path(config.capture).resolve()), "run": str(run.resolve())}
-    write_json(run / "config.json", settings)
-    state = _start(capture, volumes, seeds, config, rng)
+    usual = usual_points(capture, [r.volume for r in reflectors], config)
+    config = replace(config, **{k: n for k, n in usual.items() if getattr(config, k) is None})
+    seeds = [primary_seeds(capture, reflectors, config, rng)]
+    reflectors = [r for r in reflectors if r.model != "none"]
+    seeds += [reflection_seeds(capture, r, config, rng) for r in reflectors]
+    state = _start(capture, reflectors, seeds, config, rng)
     try:
-        _loop(state, capture, volumes, seeds, config)
+        _loop(state, capture, [r.volume for r in reflectors], seeds, config)
     except KeyboardInterrupt:
         save_checkpoint(run, state)
         print(f"training: interrupted at step {state.step}, checkpoint saved; go on with --resume")
         raise
     save_checkpoint(run, state)
-    state.scene.save(finished)
+    state.scene.save(run / "scene.safetensors")
     return state.scene
 
 
-def _device(config: TrainConfig) -> torch.device:
+def device_of(config: TrainConfig) -> torch.device:
     automatic = "cuda" if torch.cuda.is_available() else "cpu"
     return torch.device(automatic if config.device == "auto" else config.device)
 
 
 def _start(
     capture: Capture,
-    volumes: list[ReflectionVolume],
+    reflectors: list[Reflector],
     seeds: list[Seeds],
     config: TrainConfig,
     rng: np.random.Generator,
 ) -> TrainState:
     path = Path(config.run) / "checkpoint.safetensors"
     if not path.exists():
-        scene = initial_scene(capture, volumes, seeds, STAGES[0].points, config).to(_device(config))
+        scene = initial_scene(capture, reflectors, seeds, STAGES[0].points, config).to(device_of(config))
         (Path(config.run) / "metrics.jsonl").unlink(missing_ok=True)
         statistics = GradientStatistics(len(scene.primary), scene.device)
         return TrainState(scene, make_optimizer(scene, config), rng, statistics)
-    scene, tensors, notes = Scene.load_with_extras(path, _device(config))
+    scene, tensors, notes = Scene.load_with_extras(path, device_of(config))
     optimizer = make_optimizer(scene, config)
     restore_optimizer(optimizer, tensors)
     statistics = GradientStatistics(len(scene.primary), scene.device)
@@ -125,7 +115,7 @@ def _start(
     rng.bit_generator.state = notes["rng"]
     _trim_log(Path(config.run), notes["step"])
     print(f"training: going on from step {notes['step']}")
-    place = (notes[key] for key in ("step", "seconds", "stage", "queue"))
+    place = (notes[key] for key in ("step", "seconds", "stage", "queue", "gradient_norm"))
     return TrainState(scene, optimizer, rng, statistics, *place)
 
 
@@ -136,6 +126,7 @@ def save_checkpoint(run: Path, state: TrainState) -> None:
         "seconds": state.seconds,
         "stage": state.stage,
         "queue": state.queue,
+        "gradient_norm": state.gradient_norm,
         "rng": state.rng.bit_generator.state,
     }
     extra = {f"statistics.{name}": value for name, value in vars(state.statistics).items()}
@@ -250,8 +241,27 @@ def _step(
         )
     if scene.primary.positions.grad is not None:
         state.statistics.direction += scene.primary.positions.grad
+    clipped = _clip_gradients(state)
     state.optimizer.step()
-    return {k: float(np.mean([r[k] for r in records])) for k in records[0]}
+    return {k: float(np.mean([r[k] for r in records])) for k in records[0]} | {"clipped": clipped}
+
+
+def _clip_gradients(state: TrainState) -> float:
+    """Shorten the networks' gradient where it is 10 times as long as usual; returns the factor (1: nothing done).
+
+    Raises:
+        UserError: a gradient is not finite.
+    """
+    for group in state.optimizer.param_groups:
+        gradient = group["params"][0].grad
+        if gradient is not None:
+            _check_finite(state.scene, gradient.sum(), state.step, f"gradient of {group['name']}")
+    shared = [g["params"][0] for g in state.optimizer.param_groups if not g["rows"]]
+    limit = 10 * state.gradient_norm or float("inf")
+    norm = float(torch.nn.utils.clip_grad_norm_(shared, limit))
+    share = 0.05 if state.gradient_norm else 1.0
+    state.gradient_norm += share * (min(norm, limit) - state.gradient_norm)
+    return min(1.0, limit / max(norm, 1e-30))
 
 
 def _losses(

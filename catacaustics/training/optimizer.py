@@ -21,8 +21,12 @@ def _rate(name: str, config: TrainConfig, extent: float, progress: float, warm_u
         return start * math.exp(progress * math.log(end / start))
 
     kind = name.split(".")[-1]
-    if name.startswith(("renderer.", "warps.")):
+    if name.startswith("renderer.") or ".network." in name:
         return decay(config.lr_network, config.lr_network_final)
+    if name.startswith("warps."):
+        return decay(config.lr_shape, config.lr_shape / 10)
+    if name.startswith("reflections.") and kind == "positions":
+        return decay(config.lr_source, config.lr_source / 10)  # times the row's distance from the reflector
     if kind == "positions":
         return 0.0 if warm_up else extent * decay(config.lr_position, config.lr_position_final)
     if kind == "normals" and warm_up:
@@ -41,12 +45,13 @@ class RowAdam(torch.optim.Optimizer):
     """Adam (Kingma and Ba 2015), decoupled weight decay; in groups with `rows`, rows without a gradient stand still.
 
     Args:
-        groups: one parameter each, with name, lr, weight_decay and rows.
+        groups: one parameter each, with name, lr, weight_decay and rows; where a group has `row_rates` (n,), they
+            multiply the learning rate of each row.
         betas, eps: as in Adam.
     """
 
     def __init__(self, groups: list[dict], betas: tuple[float, float] = (0.9, 0.999), eps: float = 1e-15):
-        super().__init__(groups, {"betas": betas, "eps": eps})
+        super().__init__(groups, {"betas": betas, "eps": eps, "row_rates": None})
 
     @torch.no_grad()
     def step(self, closure: None = None) -> None:
@@ -63,7 +68,8 @@ class RowAdam(torch.optim.Optimizer):
                 seen = torch.nonzero(parameter.grad.reshape(len(parameter), -1).any(1))[:, 0]
                 tensors = (parameter, parameter.grad, *(state[k] for k in ("step", "exp_avg", "exp_avg_sq")))
                 rows = [t.index_select(0, seen) for t in tensors]
-                _adam(*rows, group)
+                scale = group["row_rates"]
+                _adam(*rows, group, 1.0 if scale is None else scale.index_select(0, seen))
                 for whole, part in zip(tensors, rows, strict=True):
                     if whole is not parameter.grad:
                         whole.index_copy_(0, seen, part)
@@ -71,14 +77,22 @@ class RowAdam(torch.optim.Optimizer):
                 _adam(parameter, parameter.grad, state["step"], state["exp_avg"], state["exp_avg_sq"], group)
 
 
-def _adam(value: Tensor, gradient: Tensor, step: Tensor, mean: Tensor, square: Tensor, group: dict) -> None:
-    """One step in place; `step` has one count a row, or one for all."""
+def _adam(
+    value: Tensor,
+    gradient: Tensor,
+    step: Tensor,
+    mean: Tensor,
+    square: Tensor,
+    group: dict,
+    scale: Tensor | float = 1.0,
+) -> None:
+    """One step in place; `step` and `scale` have one number a row, or one for all."""
     beta1, beta2 = group["betas"]
     step += 1
     mean.lerp_(gradient, 1 - beta1)
     square.mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
     shape = (-1,) + (1,) * (value.ndim - 1) if group["rows"] else ()
-    rate = group["lr"] * ((1 - beta2**step).sqrt() / (1 - beta1**step)).reshape(shape)
+    rate = (group["lr"] * scale * (1 - beta2**step).sqrt() / (1 - beta1**step)).reshape(shape)
     value.mul_(1 - group["lr"] * group["weight_decay"])
     value.sub_(rate * mean / (square.sqrt() + group["eps"]))
 
@@ -90,14 +104,25 @@ def make_optimizer(scene: Scene, config: TrainConfig) -> RowAdam:
             "params": [parameter],
             "name": name,
             "lr": 0.0,
-            "weight_decay": config.warp_weight_decay if name.startswith("warps.") else 0.0,
+            "weight_decay": config.warp_weight_decay if ".network." in name else 0.0,
             "rows": name.startswith(("primary.", "reflections.")),
+            "row_rates": _source_distances(scene, name),
         }
         for name, parameter in scene.named_parameters()
         if parameter.requires_grad
     ]
     # Losses are weighted by 0.05 and spread over thousands of points: gradients are far below Adam's default eps.
     return RowAdam(groups, eps=1e-15)
+
+
+def _source_distances(scene: Scene, name: str) -> Tensor | None:
+    """Distances of reflection points from their reflector: a step changes their direction by equal angles."""
+    if not (name.startswith("reflections.") and name.endswith(".positions")):
+        return None
+    i = int(name.split(".")[1])
+    positions = scene.reflections[i].positions.detach()
+    center = torch.from_numpy(scene.volumes[i].center).to(positions)
+    return (positions - center).norm(dim=1).clamp_min(scene.volumes[i].radius)
 
 
 def set_rates(optimizer: RowAdam, config: TrainConfig, extent: float, progress: float, warm_up: bool) -> None:

@@ -1,0 +1,277 @@
+"""Where a curved mirror shows a point: Fermat's principle on a sphere or an ellipsoid.
+
+A mirror is the image x = s + A u of the unit sphere (|u| = 1), A = rotation times diag(radii), seen from outside
+(convex) or from inside (concave). From camera centre c, a source P is seen at the point x where the path
+L = |c - x| + |x - P| is stationary. A convex mirror has one such point that c and P both face. A concave one has up to
+four (Alhazen's problem). Where camera and source are outside the sphere, the one is kept whose normal lies between
+their directions from the centre; where one of them is inside, the one with the smallest angle of incidence: the mirror
+image of paraxial optics, upright or inverted. An ellipsoid follows from the sphere of its mean radius.
+"""
+
+import math
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from catacaustics.shapes import Bool, Float
+
+_ITERATIONS = 40
+_SCAN = 65
+"""Angles at which a concave mirror's roots are looked for, where several can be."""
+_MAX_STEP = 0.4
+"""Newton steps on the ellipsoid are cut to this many radians."""
+_GRAZING = 1e-3
+"""Cosine of incidence below which a point counts as invisible: the rim, where the image shrinks to nothing."""
+_STRETCH = 30.0
+"""Magnification is cut to this: a concave mirror with the source at the focus would show it infinitely large."""
+
+
+class Specular(NamedTuple):
+    """Points of reflection: differentiable `points`; `visible` where camera and source face the mirror there and the
+    path is stationary; `jacobian` (no gradients), the map from displacements of the source to displacements of the
+    displayed point, which lies on the ray at the length of the path."""
+
+    points: Float[Tensor, "n 3"]
+    visible: Bool[Tensor, "n"]
+    jacobian: Float[Tensor, "n 3 3"]
+
+
+def sphere_angle(
+    camera: Float[Tensor, "*n"], source: Float[Tensor, "*n"], between: Float[Tensor, "*n"], radius: Float[Tensor, ""]
+) -> Float[Tensor, "*n"]:
+    """Angle of the mirror's normal from the camera's direction, seen from the centre of a sphere.
+
+    A root of (angle of incidence of the camera) - (angle of incidence of the source). It is always bracketed, for a
+    convex mirror and for camera and source outside the sphere by [0, between], so that bisection saves Newton's method
+    wherever that leaves the bracket.
+
+    Args:
+        camera, source: distances of camera and source from the centre.
+        between: angle between their directions, in [0, pi].
+        radius: of the sphere, negative for its concave side.
+    """
+    low, high = torch.zeros_like(between), between.clone()
+    inside = (torch.minimum(camera, source) < -radius).nonzero()[:, 0] if between.ndim else []
+    if len(inside):
+        ends = _paraxial_bracket(camera[inside], source[inside], between[inside], radius)
+        low[inside], high[inside] = ends
+    angle = (low + high) / 2
+    for _ in range(_ITERATIONS):
+        value_c, slope_c = _incidence(camera, angle, radius)
+        value_p, slope_p = _incidence(source, between - angle, radius)
+        value, slope = value_c - value_p, slope_c + slope_p
+        low, high = torch.where(value < 0, angle, low), torch.where(value < 0, high, angle)
+        newton = angle - value / torch.where(slope.abs() < 1e-12, 1e-12, slope)
+        enclosed = (newton - low) * (newton - high) < 0
+        following = torch.where(enclosed, newton, (low + high) / 2)
+        done = (following - angle).abs().max() if angle.numel() else angle.new_zeros(())
+        angle = following
+        if done < 16 * torch.finfo(angle.dtype).eps:
+            break
+    return angle
+
+
+def _paraxial_bracket(camera: Tensor, source: Tensor, between: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
+    """Angles with a negative and a positive difference of incidence, around the root of least incidence; [0, between]
+    where the scan finds none."""
+    grid = torch.linspace(-math.pi, math.pi, _SCAN, dtype=between.dtype, device=between.device)
+    value_c = _incidence(camera[:, None], grid, radius)[0]
+    value_p = _incidence(source[:, None], between[:, None] - grid, radius)[0]
+    value = value_c - value_p
+    facing = (value_c.abs() < math.pi / 2) & (value_p.abs() < math.pi / 2)
+    changes = (value[:, :-1] < 0) != (value[:, 1:] < 0)
+    changes &= facing[:, :-1] & facing[:, 1:]
+    incidence = torch.where(changes, (value_c[:, :-1] + value_c[:, 1:]).abs(), torch.inf)
+    least, cell = incidence.min(1)
+    first, second = grid[cell], grid[cell + 1]
+    rising = value.gather(1, cell[:, None])[:, 0] < 0
+    low, high = torch.where(rising, first, second), torch.where(rising, second, first)
+    found = torch.isfinite(least)
+    return torch.where(found, low, 0), torch.where(found, high, between)
+
+
+def _incidence(distance: Tensor, angle: Tensor, radius: Tensor) -> tuple[Tensor, Tensor]:
+    """Angle between the normal and the ray to a point at `distance` from the centre, `angle` from the normal; and its
+    derivative by `angle`."""
+    across, along = distance * torch.sin(angle), distance * torch.cos(angle) - radius
+    squared = (across**2 + along**2).clamp_min(torch.finfo(angle.dtype).tiny)
+    return torch.atan2(across, along), (distance**2 - radius * distance * torch.cos(angle)) / squared
+
+
+def specular_points(
+    sources: Float[Tensor, "n 3"],
+    camera: Float[Tensor, "3"],
+    center: Float[Tensor, "3"],
+    axes: Float[Tensor, "3 3"],
+    concave: bool = False,
+) -> Specular:
+    """Points of reflection on an ellipsoid, with exact first derivatives by all arguments.
+
+    The solution is found without gradients; one more Newton step, differentiated with its Hessian held fixed, is the
+    implicit function theorem. Points inside, on or behind the mirror get a finite answer that is not visible.
+
+    Args:
+        sources: world positions of what is mirrored.
+        camera: camera centre.
+        center, axes: x = center + axes @ u for unit u; the columns are the half-axes.
+        concave: the inner side mirrors.
+    """
+    with torch.no_grad():
+        u = _solve(sources, camera, center, axes, concave)
+        basis = _tangents(u)
+        path = _path(u, sources, camera, center, axes)
+        hessian = _hessian(path, u, basis, axes)
+    gradient = _gradient(_path(u, sources, camera, center, axes), axes)
+    step = _solve2(hessian, torch.einsum("nij,ni->nj", basis, gradient))
+    moved = u - torch.einsum("nij,nj->ni", basis, _shortened(step, _MAX_STEP))
+    points = center + torch.nn.functional.normalize(moved, dim=1) @ axes.T
+    with torch.no_grad():
+        normal = torch.nn.functional.normalize(u @ torch.linalg.inv(axes), dim=1) * (-1 if concave else 1)
+        cosine = torch.minimum((normal * path.to_camera).sum(1), (normal * path.to_source).sum(1))
+        tangential = path.to_camera + path.to_source
+        tangential = tangential - (tangential * normal).sum(1, keepdim=True) * normal
+        visible = (cosine > _GRAZING) & (tangential.norm(dim=1) < 1e-2)
+        jacobian = _display_jacobian(path, hessian, basis, axes)
+    return Specular(points, visible, jacobian)
+
+
+class _Path(NamedTuple):
+    """Unit vectors from the mirror to camera and source, and the distances."""
+
+    to_camera: Tensor
+    to_source: Tensor
+    camera_distance: Tensor
+    source_distance: Tensor
+
+
+def _path(u: Tensor, sources: Tensor, camera: Tensor, center: Tensor, axes: Tensor) -> _Path:
+    points = center + u @ axes.T
+    a, b = camera - points, sources - points
+    tiny = torch.finfo(u.dtype).tiny ** 0.5
+    da, db = (torch.sqrt((v * v).sum(1, keepdim=True) + tiny) for v in (a, b))
+    return _Path(a / da, b / db, da, db)
+
+
+def _gradient(path: _Path, axes: Tensor) -> Tensor:
+    """dL/du."""
+    return -(path.to_camera + path.to_source) @ axes
+
+
+def _hessian(path: _Path, u: Tensor, basis: Tensor, axes: Tensor) -> Tensor:
+    """Second derivatives of L along the tangents of the unit sphere, (n, 2, 2), kept away from singular."""
+    edges = torch.einsum("ij,njk->nik", axes, basis)
+    total = edges.new_zeros(len(u), 2, 2)
+    for direction, distance in (path[::2], path[1::2]):
+        along = torch.einsum("nij,ni->nj", edges, direction)
+        total += (edges.transpose(1, 2) @ edges - along[:, :, None] * along[:, None, :]) / distance[:, :, None]
+    curvature = -(u * _gradient(path, axes)).sum(1)
+    total.diagonal(dim1=1, dim2=2).add_(curvature[:, None])
+    return total
+
+
+def _solve2(matrix: Tensor, vector: Tensor) -> Tensor:
+    """Solve symmetric 2x2 systems; a singular one gives a large finite answer."""
+    a, b, d = matrix[:, 0, 0], matrix[:, 0, 1], matrix[:, 1, 1]
+    x, y = vector.unbind(1)
+    return torch.stack([d * x - b * y, a * y - b * x], 1) / _determinant(matrix)[:, None]
+
+
+def _determinant(matrix: Tensor) -> Tensor:
+    determinant = matrix[:, 0, 0] * matrix[:, 1, 1] - matrix[:, 0, 1] ** 2
+    floor = 1e-6 * matrix.square().sum((1, 2)) + torch.finfo(matrix.dtype).tiny ** 0.5
+    return torch.where(determinant.abs() < floor, torch.where(determinant < 0, -floor, floor), determinant)
+
+
+def _shortened(step: Tensor, limit: float) -> Tensor:
+    return step / (step.norm(dim=1, keepdim=True) / limit).clamp_min(1)
+
+
+def _tangents(u: Tensor) -> Tensor:
+    """Two orthonormal tangents of the unit sphere, (n, 3, 2) (Duff et al. 2017)."""
+    x, y, z = u.unbind(1)
+    sign = torch.where(z < 0, -torch.ones_like(z), torch.ones_like(z))
+    a = -1 / (sign + z)
+    b = x * y * a
+    first = torch.stack([1 + sign * x * x * a, sign * b, -sign * x], 1)
+    return torch.stack([first, torch.stack([b, sign + y * y * a, -y], 1)], 2)
+
+
+def _solve(sources: Tensor, camera: Tensor, center: Tensor, axes: Tensor, concave: bool) -> Tensor:
+    """Unit vectors u of the stationary points: exact for a sphere, from there by Newton's method."""
+    radii = axes.norm(dim=0)
+    v, w = (camera - center).expand_as(sources), sources - center
+    dv, dw = v.norm(dim=1), w.norm(dim=1)
+    tiny = torch.finfo(sources.dtype).tiny
+    unit_v, unit_w = v / dv.clamp_min(tiny)[:, None], w / dw.clamp_min(tiny)[:, None]
+    # Across v, in the plane of v and w; any perpendicular where they are in line.
+    across = unit_w - (unit_w * unit_v).sum(1, keepdim=True) * unit_v
+    between = torch.atan2(across.norm(dim=1), (unit_w * unit_v).sum(1))
+    sideways = torch.where(across.norm(dim=1, keepdim=True) > 1e-6, across, _tangents(unit_v)[:, :, 0])
+    sideways = torch.nn.functional.normalize(sideways, dim=1)
+    sign = -1.0 if concave else 1.0
+    angle = sphere_angle(dv, dw, between, sign * radii.mean())[:, None]
+    normal = torch.cos(angle) * unit_v + torch.sin(angle) * sideways
+    u = sign * torch.nn.functional.normalize(normal @ axes, dim=1)
+    if float(radii.max() - radii.min()) <= 1e-6 * float(radii.max()):
+        return u
+    for _ in range(_ITERATIONS):
+        path, basis = _path(u, sources, camera, center, axes), _tangents(u)
+        gradient = torch.einsum("nij,ni->nj", basis, _gradient(path, axes))
+        hessian = _hessian(path, u, basis, axes)
+        if not concave:
+            # L has a minimum: where it is not convex yet, add to the diagonal until it is.
+            middle = (hessian[:, 0, 0] + hessian[:, 1, 1]) / 2
+            spread = ((hessian[:, 0, 0] - hessian[:, 1, 1]) ** 2 / 4 + hessian[:, 0, 1] ** 2).sqrt()
+            lift = (1e-3 * (middle.abs() + spread) - (middle - spread)).clamp_min(0)
+            hessian.diagonal(dim1=1, dim2=2).add_(lift[:, None])
+        step = _shortened(_solve2(hessian, gradient), _MAX_STEP)
+        u = torch.nn.functional.normalize(u - torch.einsum("nij,nj->ni", basis, step), dim=1)
+        if float(step.abs().max() if step.numel() else 0) < 8 * torch.finfo(u.dtype).eps:
+            break
+    return u
+
+
+def _display_jacobian(path: _Path, hessian: Tensor, basis: Tensor, axes: Tensor) -> Tensor:
+    """d(displayed) / d(source) across the ray: D / (d1 d2) (I - a a') E H^-1 E' (I - b b'), E the mirror's tangents.
+
+    For a sphere this is Coddington's pair of magnifications, 1 / (1 + 2 d1 d2 cos(i) / (r D)) across the plane of
+    incidence and 1 / (1 + 2 d1 d2 / (r cos(i) D)) in it, D = d1 + d2.
+    """
+    edges = torch.einsum("ij,njk->nik", axes, basis)
+    columns = []
+    for direction, distance in (path[::2], path[1::2]):
+        across = edges - direction[:, :, None] * torch.einsum("ni,nij->nj", direction, edges)[:, None, :]
+        columns.append(across / distance[:, :, None])
+    a, b, d = hessian[:, 0, 0], hessian[:, 0, 1], hessian[:, 1, 1]
+    inverse = torch.stack([d, -b, -b, a], 1).view(-1, 2, 2) / _determinant(hessian)[:, None, None]
+    length = (path.camera_distance + path.source_distance)[:, :, None]
+    return length * columns[0] @ inverse @ columns[1].transpose(1, 2)
+
+
+def tilted_disks(
+    jacobian: Float[Tensor, "n 3 3"], to_camera: Float[Tensor, "n 3"]
+) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
+    """Normals and factors of the squared radius of disks that look like the images of round sources under a Jacobian.
+
+    A disk whose normal is tilted by t against the ray looks like an ellipse of axes 1 and cos t, so that every ellipse
+    can be shown by a disk.
+
+    Args:
+        jacobian: across the rays (its columns are perpendicular to `to_camera`).
+        to_camera: unit vectors.
+    """
+    basis = _tangents(to_camera)
+    flat = basis.transpose(1, 2) @ jacobian
+    covariance = flat @ flat.transpose(1, 2)
+    a, b, d = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    middle, half = (a + d) / 2, (a - d) / 2
+    spread = (half * half + b * b).sqrt()
+    major, minor = (middle + spread), (middle - spread).clamp_min(0)
+    aspect = (minor / major.clamp_min(torch.finfo(a.dtype).tiny)).clamp(0, 1)
+    # The major axis is at half the angle of (half, b); the minor one across it.
+    turn = torch.atan2(b, half) / 2
+    axis = torch.stack([-torch.sin(turn), torch.cos(turn)], 1)
+    sideways = torch.einsum("nij,nj->ni", basis, axis)
+    normals = aspect.sqrt()[:, None] * to_camera + (1 - aspect).sqrt()[:, None] * sideways
+    return normals, major.clamp(1e-8, _STRETCH**2)

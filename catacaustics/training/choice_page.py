@@ -1,0 +1,94 @@
+"""model_choice.html: what the trials of model selection showed, as one self-contained page."""
+
+from collections.abc import Sequence
+from html import escape
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+_TITLES = {
+    "model": ("What are the reflectors?", "PSNR inside the reflector"),
+    "environment": ("Does the scene need an environment map?", "PSNR of the whole image"),
+    "reflection points": ("How many reflection points?", "PSNR inside the reflectors"),
+    "primary points": ("How many primary points?", "PSNR of the whole image"),
+}
+
+
+def choice_html(folder: Path, result: dict[str, Any], least_gain: float) -> str:
+    """The page.
+
+    Args:
+        folder: the run's folder; names the page.
+        result: what model_choice.json holds.
+        least_gain: dB, of the rule.
+    """
+    place = folder.absolute()
+    name = escape(f"{place.parent.name} / {place.name}")
+    chosen, reflectors, trials = result["chosen"], result["reflectors"], result["trials"]
+    models = ", ".join(f"<b>{escape(r)}</b>: {escape(m)}" for r, m in zip(reflectors, chosen["model"], strict=True))
+    rest = ", ".join(
+        f"{k.replace('_', ' ')} {v:,}" if v else f"no {k.replace('_width', '')} map"
+        for k, v in chosen.items()
+        if k != "model"
+    )
+    rule = (
+        "Candidates of a question stand in order of complexity. A more complex one is taken only if its mean gain over "
+        f"the best so far exceeds both {least_gain:g} dB and twice the standard error of the gain per view. Scores are "
+        "means over training views that the trials did not see; every trial had the same time."
+    )
+    sections = []
+    for question, (title, measure) in _TITLES.items():
+        rows = [t for t in trials if t["question"] == question]
+        for i, taken in enumerate(result["taken"].get(question, [])):
+            heading = f"{title} {escape(reflectors[i])}" if question == "model" and len(reflectors) > 1 else title
+            sections.append(f"<section><h2>{heading}</h2>{_table(rows, question, i, measure, taken)}</section>")
+    style = Path(__file__).parents[1].joinpath("report.css").read_text()
+    bars = (
+        ".bars td, .bars th { padding: .35rem 1rem; text-align: right; } .bars th:first-child { text-align: left; }"
+        ".bars td.track { width: 22rem; text-align: left; } .bars tbody tr { border-top: 1px solid var(--line); }"
+        ".track i { display: block; height: .8rem; border-radius: 3px; background: var(--accent); opacity: .55; }"
+        ".taken { font-weight: 600; } .taken .track i { opacity: 1; }"
+    )
+    return (
+        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{name}: model choice</title>'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f'<meta name="color-scheme" content="light dark"><style>\n{style}{bars}</style></head>\n<body><main>'
+        f'<header><p class="facts">Model choice</p><h1>{name}</h1><p>{models}{"; " + rest if rest else ""}</p>'
+        f'<p class="hint">{rule}</p></header>' + "\n".join(sections) + "</main></body></html>\n"
+    )
+
+
+def _table(rows: Sequence[dict[str, Any]], question: str, reflector: int, measure: str, taken: str) -> str:
+    scores = [_score(t, question, reflector) for t in rows]
+    low, high = min(scores), max(scores)
+    body = []
+    for trial, score in zip(rows, scores, strict=True):
+        width = 8 + 92 * (score - low) / max(high - low, 1e-6)
+        cells = (
+            f'<td>{score:.2f} dB</td><td class="track"><i style="width:{width:.1f}%"></i></td>'
+            f"<td>{trial['seconds']:.1f}</td><td>{trial['steps']}</td><td>{trial['points']:,}</td>"
+            f"<td>{trial['parameters']:,}</td>"
+        )
+        mark = ' class="taken"' if trial["name"] == taken else ""
+        note = " (taken)" if trial["name"] == taken else ""
+        body.append(f'<tr{mark}><th scope="row">{escape(trial["name"])}{note}</th>{cells}</tr>')
+    head = (
+        f"<tr><th>candidate</th><th>{measure}</th><th></th><th>seconds</th><th>steps</th><th>points</th>"
+        "<th>network parameters</th></tr>"
+    )
+    return f'<div class="scroll"><table class="bars"><thead>{head}</thead><tbody>{"".join(body)}</tbody></table></div>'
+
+
+def scores_of(trial: dict[str, Any], question: str, reflector: int = 0) -> list[float | None]:
+    """The scores per view that a question is decided by."""
+    if question == "model":
+        return trial["inside"][reflector]
+    if question == "reflection points":
+        return [score for scores in trial["inside"] for score in scores]
+    return trial["whole"]
+
+
+def _score(trial: dict[str, Any], question: str, reflector: int) -> float:
+    values = [v for v in scores_of(trial, question, reflector) if v is not None]
+    return float(np.mean(values)) if values else 0.0

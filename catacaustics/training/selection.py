@@ -1,0 +1,235 @@
+"""Model selection: short trials decide what a scene needs, scored on training views that the trials do not see.
+
+The rule. Rungs are walked from the simplest to the most complex. A more complex one takes the place of the best so far
+only if its mean gain in PSNR inside the reflector exceeds both 0.2 dB and twice the standard error of the gains per
+view: what the noise of a few views could explain is not a reason. The environment map and larger clouds must earn their
+place by the same rule, judged on the whole image and inside the reflectors. All trials get the same seconds.
+"""
+
+import shutil
+import time
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from catacaustics.capture.dataset import Capture, View
+from catacaustics.config import TrainConfig
+from catacaustics.files import read_json, write_json, write_text
+from catacaustics.images import resize
+from catacaustics.metrics import psnr
+from catacaustics.reflectors.volume import ReflectionVolume
+from catacaustics.scene import Scene
+from catacaustics.training.choice_page import choice_html
+from catacaustics.training.initialize import named_reflectors, usual_points
+from catacaustics.training.loop import fit
+from catacaustics.training.photographs import scaled_camera
+
+LADDER = ("none", "static", "plane", "sphere", "ellipsoid", "concave", "neural", "quadric+neural")
+"""Rungs from the simplest to the most complex."""
+
+LEAST_GAIN = 0.2
+"""dB that a more complex candidate must gain at least."""
+
+_SHARE = 0.25
+"""Of the training's minutes, spent on all trials together."""
+_STEPS = 400
+"""Steps of a trial at most; without a time limit, all of them are done."""
+_SIZE = 240
+"""Longer side of the images in trials."""
+_PATCH = 120
+_FACTORS = (0.5, 1.0, 2.0)
+"""Sizes of a cloud that are tried, in units of `usual_points`."""
+_VIEWS = 8
+"""Validation views at most."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What a candidate was and reached.
+
+    Args:
+        name: what was tried.
+        question: what it was tried for: model, environment, reflection points or primary points.
+        settings: fields of TrainConfig in which it differs.
+        seconds, steps, points, parameters: of the trial; points of all clouds, parameters besides points.
+        inside: PSNR in dB inside each reflector, a list of views each (None where a view does not show it).
+        whole: PSNR in dB of the whole image, a list of views.
+    """
+
+    name: str
+    question: str
+    settings: dict
+    seconds: float
+    steps: int
+    points: int
+    parameters: int
+    inside: list[list[float | None]]
+    whole: list[float]
+
+
+def gain(new: list[float | None], old: list[float | None]) -> tuple[float, float]:
+    """Mean of the paired differences over views, and the gain that noise could explain (never below LEAST_GAIN)."""
+    differences = np.array(new, float) - np.array(old, float)
+    differences = differences[np.isfinite(differences)]
+    if not len(differences):
+        return 0.0, LEAST_GAIN
+    error = differences.std(ddof=1) / np.sqrt(len(differences)) if len(differences) > 1 else np.inf
+    return float(differences.mean()), float(max(LEAST_GAIN, 2 * error))
+
+
+def best(scores: list[list[float | None]]) -> int:
+    """Index of the candidate to take: the first, unless a later one wins by more than the noise."""
+    chosen = 0
+    for i in range(1, len(scores)):
+        difference, noise = gain(scores[i], scores[chosen])
+        if difference > noise:
+            chosen = i
+    return chosen
+
+
+def choose_models(capture: Capture, volumes: list[ReflectionVolume], config: TrainConfig) -> TrainConfig:
+    """The configuration with every `auto` decided; nothing to do where none is. Writes RUN/model_choice.json and
+    RUN/model_choice.html; an earlier choice found there is kept, and so are finished trials.
+
+    The trials' time is taken from the training's minutes.
+    """
+    if not volumes:
+        return replace(config, model=("none",))
+    reflectors = named_reflectors(volumes, config.model)
+    if not any(r.model == "auto" for r in reflectors):
+        return config
+    trials = _Trials(capture, volumes, config)
+    rungs = [trials.run(rung, "model", {"model": _filled(reflectors, rung)}) for rung in LADDER]
+    models = [
+        LADDER[best([trial.inside[i] for trial in rungs])] if r.model == "auto" else r.model
+        for i, r in enumerate(reflectors)
+    ]
+    chosen: dict = {"model": tuple(models)}
+    taken = {"model": models}
+    if config.environment_width:
+        without = trials.run("no environment map", "environment", chosen | {"environment_width": 0})
+        base = trials.run("environment map", "environment", chosen)
+        if best([without.whole, base.whole]) == 0:
+            chosen["environment_width"] = 0
+        taken["environment"] = [(without, base)[best([without.whole, base.whole])].name]
+    for question, field in (("reflection points", "reflection_points"), ("primary points", "primary_points")):
+        if getattr(config, field) is not None or (field == "reflection_points" and set(models) == {"none"}):
+            continue
+        usual = usual_points(capture, volumes, trials.config)[field]
+        tried = {f"{int(factor * usual):,} ({factor:g} x usual)": {field: int(factor * usual)} for factor in _FACTORS}
+        done = [trials.run(name, question, chosen | settings) for name, settings in tried.items()]
+        index = best([_joined(t) if field == "reflection_points" else t.whole for t in done])
+        taken[question] = [done[index].name]
+        chosen[field] = int(_FACTORS[index] * usual_points(capture, volumes, config)[field])
+    trials.finish(chosen, taken, [v.name for v in volumes])
+    minutes = None if config.minutes is None else max(config.minutes - trials.seconds / 60, 0.25 * config.minutes)
+    return replace(config, minutes=minutes, **chosen)
+
+
+def _filled(reflectors: list, rung: str) -> tuple[str, ...]:
+    return tuple(rung if r.model == "auto" else r.model for r in reflectors)
+
+
+def _joined(trial: Trial) -> list[float | None]:
+    return [score for scores in trial.inside for score in scores]
+
+
+class _Trials:
+    """Runs trials and keeps their results in RUN/model_choice.json."""
+
+    def __init__(self, capture: Capture, volumes: list[ReflectionVolume], config: TrainConfig):
+        # At least two validation views, and most views left to learn from.
+        views = capture.train
+        every = max(3, len(views) // _VIEWS)
+        self.validation = views[every // 2 :: every][:_VIEWS]
+        self.capture = replace(capture, train=[v for v in views if v not in self.validation], held_out=[])
+        self.volumes = volumes
+        self.run_folder = Path(config.run)
+        trials = len(LADDER) + 6
+        size = min(_SIZE, config.image_size)
+        named = {k: getattr(config, k) for k in ("primary_points", "reflection_points")}
+        self.config = replace(
+            config,
+            **{k: n and max(500, int(n * (size / config.image_size) ** 2)) for k, n in named.items()},
+            image_size=size,
+            iterations=min(_STEPS, config.iterations),
+            minutes=None if config.minutes is None else _SHARE * config.minutes / trials,
+            patch=_PATCH,
+            accumulate=1,
+            environment_width=min(config.environment_width, 200),
+            resume=False,
+        )
+        self._key = {k: str(v) for k, v in asdict(config).items() if k not in ("run", "resume")}
+        self.done = self._read()
+
+    @property
+    def seconds(self) -> float:
+        return sum({str(t.settings): t.seconds for t in self.done}.values())
+
+    def run(self, name: str, question: str, settings: dict) -> Trial:
+        """The result of a trial, run now or found."""
+        found = [t for t in self.done if t.name == name and t.question == question]
+        if found:
+            return found[0]
+        same = [t for t in self.done if dict(t.settings) == _plain(settings)]
+        trial = replace(same[0], name=name, question=question) if same else None
+        if trial is None:
+            folder = self.run_folder / "trials" / name.replace(" ", "_")
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir(parents=True)
+            config = replace(self.config, run=folder, **settings)
+            print(f"model selection: {question}, {name}")
+            started = time.monotonic()
+            scene = fit(self.capture, named_reflectors(self.volumes, config.model), config)
+            trial = self._scored(scene, name, question, settings, time.monotonic() - started, folder)
+            for heavy in ("checkpoint.safetensors", "scene.safetensors"):
+                (folder / heavy).unlink(missing_ok=True)
+        self.done.append(trial)
+        write_json(self.run_folder / "model_choice.json", {"key": self._key, "trials": [asdict(t) for t in self.done]})
+        return trial
+
+    def finish(self, chosen: dict, taken: dict[str, list[str]], reflectors: list[str]) -> None:
+        result = {
+            "key": self._key,
+            "chosen": _plain(chosen),
+            "taken": taken,
+            "reflectors": reflectors,
+            "trials": [asdict(t) for t in self.done],
+        }
+        write_json(self.run_folder / "model_choice.json", result)
+        write_text(self.run_folder / "model_choice.html", choice_html(self.run_folder, result, LEAST_GAIN))
+        words = ", ".join(f"{k} {' '.join(map(str, v)) if isinstance(v, tuple) else v}" for k, v in chosen.items())
+        print(f"model selection: {words}; why: {self.run_folder / 'model_choice.html'}")
+
+    def _read(self) -> list[Trial]:
+        path = self.run_folder / "model_choice.json"
+        if not path.is_file():
+            return []
+        kept = read_json(path)
+        return [Trial(**t) for t in kept["trials"]] if kept.get("key") == self._key else []
+
+    def _scored(self, scene: Scene, name: str, question: str, settings: dict, seconds: float, folder: Path) -> Trial:
+        inside: list[list[float | None]] = [[] for _ in self.volumes]
+        whole = []
+        for view in self.validation:
+            camera = scaled_camera(view.camera, self.config.image_size, 1.0)
+            image, photo = scene.render(camera).rgb.cpu().numpy(), self._photograph(view, camera.width, camera.height)
+            whole.append(psnr(image, photo))
+            for scores, volume in zip(inside, self.volumes, strict=True):
+                mask = volume.project_mask(camera)
+                scores.append(psnr(image[mask], photo[mask]) if mask.any() else None)
+        points = sum(len(c) for c in (scene.primary, *scene.reflections))
+        parameters = sum(
+            p.numel() for n, p in scene.named_parameters() if n.startswith(("warps", "renderer", "environment"))
+        )
+        steps = len((folder / "metrics.jsonl").read_text().splitlines()) * 10
+        return Trial(name, question, _plain(settings), seconds, steps, points, parameters, inside, whole)
+
+    def _photograph(self, view: View, width: int, height: int) -> np.ndarray:
+        return resize(self.capture.image(view), width, height).astype(np.float32) / 255
+
+
+def _plain(settings: dict) -> dict:
+    """As JSON gives it back."""
+    return {k: list(v) if isinstance(v, tuple) else v for k, v in settings.items()}
