@@ -220,5 +220,20 @@ class MaskConfig:
 
 
 @dataclass(frozen=True)
+class MaskConfig:
+    """Paint the masks of reflectors in the browser, and see at once what volume they make."""
+
+    capture: Path
+    """Folder made by `catacaustics calibrate`."""
+    import_: Path | None = None
+    """Take masks made with any editor, FOLDER/REFLECTOR/STEM.png at the size of the capture's photographs, and exit.
+    They replace all masks of those reflectors; the old ones are kept in removed_masks/."""
+    browser: bool = True
+    """Open the page in the browser; its address is printed in any case."""
+    port: int = 8642
+    """Port on 127.0.0.1; where it is in use, any free one is taken."""
+
+
+@dataclass(frozen=True)
 class DoctorConfig:
     """What is installed, what it can do here, and what would make it faster."""

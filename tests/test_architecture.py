@@ -36,6 +36,7 @@ FLOORS = [
     "evaluation",
     "video",
     "reconstruct",
+    "web",
     "doctor",
     "cli",
 ]
