@@ -16,6 +16,28 @@ class EnvironmentMap(nn.Module):
         super().__init__()
         self.features = nn.Parameter(torch.zeros(FEATURES, height, width))
 
+    def start_from(
+        self, directions: Float[Tensor, "n 3"], colors: Float[Tensor, "n 3"], weights: Float[Tensor, "n"]
+    ) -> None:
+        """Set the colours (the first three features) to weighted means of what was seen; texels that saw little take
+        them from coarser levels (push-pull, Gortler et al. 1996)."""
+        _, height, width = self.features.shape
+        x, y, z = directions.unbind(-1)
+        column = ((torch.atan2(x, z) / math.pi + 1) / 2 * width).long().clamp(0, width - 1)
+        row = ((torch.asin(y.clamp(-1, 1)) / (math.pi / 2) + 1) / 2 * height).long().clamp(0, height - 1)
+        sums = colors.new_zeros(4, height * width)
+        sums.index_add_(1, row * width + column, torch.cat([colors * weights[:, None], weights[:, None]], 1).T)
+        levels = [sums.view(1, 4, height, width)]
+        while max(levels[-1].shape[2:]) > 1:
+            levels.append(4 * torch.nn.functional.avg_pool2d(levels[-1], 2, ceil_mode=True, count_include_pad=False))
+        filled = levels[-1][:, :3] / levels[-1][:, 3:].clamp_min(1e-6)
+        for level in reversed(levels[:-1]):
+            coarse = torch.nn.functional.interpolate(filled, level.shape[2:], mode="bilinear", align_corners=False)
+            # A prior of one pixel's weight from the coarser level.
+            filled = (level[:, :3] + coarse) / (level[:, 3:] + 1)
+        with torch.no_grad():
+            self.features[:3] = filled[0]
+
     def forward(self, directions: Float[Tensor, "height width 3"]) -> Float[Tensor, "height width 6"]:
         """Bilinear lookup for unit world directions; longitude wraps around, the poles are the y axis."""
         x, y, z = directions.unbind(-1)

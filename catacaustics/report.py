@@ -177,7 +177,11 @@ def _summary(mean: dict[str, Any]) -> str:
 
 
 def _links(folder: Path, capture: Path) -> str:
-    targets = {"Capture report": capture / "report.html", "Metrics as JSON": folder / "metrics.json"}
+    targets = {
+        "Why this model": folder / "model_choice.html",
+        "Capture report": capture / "report.html",
+        "Metrics as JSON": folder / "metrics.json",
+    }
     targets |= {path.name: path for path in sorted(folder.glob("*.md"))}
     links = []
     for label, path in targets.items():

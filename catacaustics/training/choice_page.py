@@ -64,7 +64,7 @@ def _table(rows: Sequence[dict[str, Any]], question: str, reflector: int, measur
     low, high = min(scores), max(scores)
     body = []
     for trial, score in zip(rows, scores, strict=True):
-        width = 8 + 92 * (score - low) / max(high - low, 1e-6)
+        width = 8 + 92 * (score - low) / max(high - low, 1.0)
         cells = (
             f'<td>{score:.2f} dB</td><td class="track"><i style="width:{width:.1f}%"></i></td>'
             f"<td>{trial['seconds']:.1f}</td><td>{trial['steps']}</td><td>{trial['points']:,}</td>"

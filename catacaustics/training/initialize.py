@@ -10,6 +10,7 @@ from catacaustics.capture.dataset import Capture
 from catacaustics.config import SplatConfig, TrainConfig
 from catacaustics.environment import EnvironmentMap
 from catacaustics.errors import UserError
+from catacaustics.images import resize
 from catacaustics.reflectors.fit import fit_ellipsoid, fit_plane, fit_sphere, surroundings
 from catacaustics.reflectors.volume import ReflectionVolume
 from catacaustics.reflectors.warps import (
@@ -231,7 +232,26 @@ def initial_scene(
     ]
     volumes = [r.volume for r in reflectors]
     near = 1e-2 * scene_extent(capture)
-    return Scene(primary, clouds, warps, volumes, environment, renderer, SplatConfig(near=near, alpha_min=1 / 255))
+    scene = Scene(primary, clouds, warps, volumes, environment, renderer, SplatConfig(near=near, alpha_min=1 / 255))
+    if environment is not None:
+        environment.start_from(*seen_through(capture, scene, config))
+    return scene
+
+
+def seen_through(
+    capture: Capture, scene: Scene, config: TrainConfig, size: int = 200, views: int = 24
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Directions, colours and weights of what the photographs show where the primary cloud is open."""
+    parts = []
+    for view in capture.train[:: max(1, len(capture.train) // views)]:
+        camera = scaled_camera(view.camera, min(size, config.image_size), 1.0)
+        with torch.no_grad():
+            layers = scene.layers(camera)
+        photo = resize(capture.image(view), camera.width, camera.height)
+        colors = torch.from_numpy(photo).to(scene.device).float().view(-1, 3) / 255
+        parts.append((layers.directions.view(-1, 3), colors, layers.transmittance.reshape(-1)))
+    directions, colors, weights = (torch.cat(p) for p in zip(*parts, strict=True))
+    return directions, colors, weights
 
 
 def stage_count(seeds: Seeds, share: float) -> int:

@@ -1,0 +1,84 @@
+"""Model selection: the rule, and the choice on a capture whose answer is known."""
+
+import json
+
+import numpy as np
+import pytest
+from toy import make_toy_capture
+
+from catacaustics.config import TrainConfig
+from catacaustics.errors import UserError
+from catacaustics.reflectors.volume import ReflectionVolume
+from catacaustics.training.initialize import named_reflectors
+from catacaustics.training.selection import LADDER, LEAST_GAIN, best, gain
+from catacaustics.training.train import train
+
+
+def test_a_more_complex_candidate_wins_only_by_more_than_the_noise():
+    base = [20.0, 22.0, 19.0, 25.0]
+    assert best([base, [v + 1 for v in base]]) == 1
+    assert best([base, [v + LEAST_GAIN / 2 for v in base]]) == 0  # steady, but too little
+    assert best([base, [20.0 + 4, 22.0 - 3, 19.0 + 4, 25.0 - 3]]) == 0  # a mean of 0.5 that four views cannot prove
+    assert best([base, [v + 1 for v in base], [v + 1.1 for v in base]]) == 1
+    assert best([base, [v - 1 for v in base], [v + 3 for v in base]]) == 2
+
+
+def test_views_that_do_not_show_a_reflector_do_not_count():
+    assert gain([21.0, None, 21.0], [20.0, 5.0, 20.0]) == (pytest.approx(1.0), LEAST_GAIN)
+    assert gain([None], [None])[0] == 0
+
+
+def test_as_many_models_as_reflectors_or_one_for_all():
+    nothing = np.zeros((0, 4)), np.zeros((0, 3)), np.zeros((0, 3), int)
+    volumes = [ReflectionVolume(name, *nothing) for name in "ab"]
+    assert [r.model for r in named_reflectors(volumes, ("plane",))] == ["plane", "plane"]
+    assert [r.model for r in named_reflectors(volumes, ("plane", "sphere"))] == ["plane", "sphere"]
+    with pytest.raises(UserError, match="3 models are named for 2 reflectors"):
+        named_reflectors(volumes, ("plane", "sphere", "none"))
+
+
+@pytest.fixture(scope="module")
+def chosen(tmp_path_factory):
+    """A ball of one flat colour needs no reflection that moves."""
+    root = tmp_path_factory.mktemp("selection")
+    capture = make_toy_capture(root / "capture")
+    config = TrainConfig(capture, root / "run", iterations=10, image_size=64, environment_width=20, warp_width=16)
+    train(config)
+    return config, json.loads((root / "run" / "model_choice.json").read_text())
+
+
+def test_every_rung_is_tried_and_the_choice_is_kept_with_its_reasons(chosen):
+    config, choice = chosen
+    assert [t["name"] for t in choice["trials"] if t["question"] == "model"] == list(LADDER)
+    assert set(choice["taken"]) == {"model", "environment", "reflection points", "primary points"} - (
+        {"reflection points"} if choice["chosen"]["model"] == ["none"] else set()
+    )
+    settings = json.loads((config.run / "config.json").read_text())
+    assert settings["model"] == choice["chosen"]["model"]
+    page = (config.run / "model_choice.html").read_text()
+    assert all(rung in page for rung in LADDER)
+    assert "standard error" in page
+    assert all(np.isfinite(t["whole"]).all() for t in choice["trials"])
+
+
+def test_a_rung_that_cannot_fit_trains_and_reports_its_score(chosen):
+    _, choice = chosen
+    plane = next(t for t in choice["trials"] if t["name"] == "plane")
+    assert plane["steps"] > 0
+    assert all(v is None or np.isfinite(v) for v in plane["inside"][0])
+
+
+def test_a_choice_once_made_is_not_made_again(chosen, monkeypatch, capsys):
+    config, choice = chosen
+    (config.run / "scene.safetensors").unlink()
+    (config.run / "checkpoint.safetensors").unlink()
+    train(config)
+    assert "model selection: model," not in capsys.readouterr().out
+    assert json.loads((config.run / "model_choice.json").read_text()) == choice
+
+
+def test_a_capture_without_masks_trains_the_primary_cloud_alone(tmp_path, capsys):
+    capture = make_toy_capture(tmp_path / "capture", masks=False)
+    scene = train(TrainConfig(capture, tmp_path / "run", iterations=4, image_size=64, environment_width=20))
+    assert "no reflector" in capsys.readouterr().out
+    assert len(scene.reflections) == 0
