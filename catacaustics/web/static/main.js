@@ -47,9 +47,10 @@ function showProblem(problem) {
 
 function showStatus() {
   const count = painting.unsaved().length;
-  const status = painting.problem && count ? 'unsaved' : painting.saving || count ? 'saving' : 'saved';
+  const open = count || painting.unnoted;
+  const status = painting.problem && open ? 'unsaved' : painting.saving || open ? 'saving' : 'saved';
   $('status').dataset.state = status;
-  const words = { saved: 'All saved', saving: 'Saving…', unsaved: `Not saved: ${count} ${count === 1 ? 'mask' : 'masks'}` };
+  const words = { saved: 'All saved', saving: 'Saving…', unsaved: `Not saved${count ? `: ${count} ${count === 1 ? 'mask' : 'masks'}` : ''}` };
   $('status').querySelector('span').textContent = words[status];
   showProblem(painting.problem);
 }
@@ -149,6 +150,7 @@ function ask({ title, text, ok, cancel = 'Cancel', value, work }) {
   input.hidden = value === undefined;
   input.value = value ?? '';
   no.textContent = cancel;
+  no.onclick = () => dialog.close('');
   yes.textContent = ok;
   return new Promise((resolve) => {
     yes.onclick = async (event) => {

@@ -20,6 +20,7 @@ export class Painting extends EventTarget {
     this.done = [];
     this.undone = [];
     this.problem = null;
+    this.unnoted = false;
     this.saving = false;
   }
 
@@ -58,12 +59,22 @@ export class Painting extends EventTarget {
     this.reflector = this.makeReflector(name, color);
     this.emit('reflectors');
     this.emit('masks');
-    return this.noteReflectors();
+    this.noteReflectors();
   }
 
   noteReflectors() {
-    const colors = Object.fromEntries(this.reflectors.map((r) => [r.name, r.color]));
-    return this.attempt(() => post('reflectors', { reflectors: colors }));
+    this.unnoted = true;
+    this.flush();
+  }
+
+  async note() {
+    this.unnoted = false;
+    try {
+      await post('reflectors', { reflectors: Object.fromEntries(this.reflectors.map((r) => [r.name, r.color])) });
+    } catch (error) {
+      this.unnoted = true;
+      throw error;
+    }
   }
 
   chooseReflector(reflector) {
@@ -94,7 +105,7 @@ export class Painting extends EventTarget {
     reflector.color = color;
     this.emit('reflectors');
     this.emit('masks');
-    return this.noteReflectors();
+    this.noteReflectors();
   }
 
   // Masks and undo ---------------------------------------------------------------------------------------------------
@@ -159,20 +170,27 @@ export class Painting extends EventTarget {
 
   async flush() {
     clearTimeout(this.retry);
+    this.again = true;
     if (this.saving) return;
     this.saving = true;
     this.emit('status');
-    let next;
-    while ((next = this.unsaved().find(({ mask }) => !mask.conflict))) {
-      if (!(await this.attempt(() => this.saveMask(next.reflector, next.view, next.mask)))) {
-        this.retry = setTimeout(() => this.flush(), RETRY);
-        if (this.problem.status) await this.refresh(next.reflector);
-        break;
-      }
+    while (this.again) {
+      this.again = false;
+      await this.saveAll();
     }
     this.saving = false;
     this.emit('status');
-    if (!this.problem && this.unsaved().some(({ mask }) => !mask.conflict)) this.flush();
+    if (this.problem) this.retry = setTimeout(() => this.flush(), RETRY);
+  }
+
+  async saveAll() {
+    if (this.unnoted && !(await this.attempt(() => this.note()))) return;
+    let next;
+    while ((next = this.unsaved().find(({ mask }) => !mask.conflict))) {
+      if (await this.attempt(() => this.saveMask(next.reflector, next.view, next.mask))) continue;
+      if (this.problem.status) await this.refresh(next.reflector);
+      return;
+    }
   }
 
   // Wait until nothing is being saved; throws where something cannot be.
