@@ -250,8 +250,8 @@ class MaskStore:
             return None
         worst = self.views[poor[0]].name
         return {
-            "found": f"The masks agree badly: the others leave {fits[poor[0]]:.0%} of the mask in {worst}.",
-            "expected": f"{POOR_FIT:.0%} or more",
+            "found": f"The masks agree badly: the others leave {100 * fits[poor[0]]:.0f} % of the mask in {worst}.",
+            "expected": f"{100 * POOR_FIT:.0f} % or more",
             "remedy": f"see whether the mask in {worst} is too wide, or that in another view too tight",
             "views": poor,
         }

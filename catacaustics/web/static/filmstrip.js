@@ -101,7 +101,7 @@ export class Filmstrip {
     const runs = this.painting.runs(reflector, view);
     const report = reflector?.report;
     const painted = !isEmpty(runs);
-    const blamed = report?.problem?.views.includes(view) ?? false;
+    const blamed = this.painting.blamed(reflector).includes(view);
     const fit = report?.fits[view];
     button.classList.toggle('painted', painted);
     button.classList.toggle('blamed', blamed);

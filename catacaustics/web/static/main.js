@@ -81,7 +81,7 @@ function advise(reflector, count, report) {
     };
   }
   const problem = report?.problem;
-  if (problem && count === 1 && !problem.found.includes(' is all ')) {
+  if (problem && count === 1 && !painting.blamed(reflector).length) {
     return { state: 'start', title: 'One view painted', text: 'Two more from other sides bound the volume.', views: left };
   }
   if (problem) return { state: 'warn', title: problem.found, text: `${capital(problem.remedy)}.`, views: problem.views };
@@ -90,8 +90,12 @@ function advise(reflector, count, report) {
     return { state: 'start', title: 'Paint one or two more views', text: 'The dashed line shows what the masks leave together.', views: left };
   }
   const worst = Math.min(...Object.values(report.fits));
+  const title = `The masks agree to ${Math.round(worst * 100)}\u00a0%`;
+  if (count === 3 && left.length) {
+    return { state: 'good', title, text: 'One more view from another side makes the volume tighter.', views: left };
+  }
   return {
-    state: 'good', title: `The masks agree to ${Math.round(worst * 100)} %`,
+    state: 'good', title,
     text: 'Look through other views: the dashed line should hold the whole object, closely. If it does, this reflector is done.',
   };
 }

@@ -127,6 +127,12 @@ export class Painting extends EventTarget {
     return reflector ? [...reflector.masks].filter(([, mask]) => !isEmpty(mask.runs)).map(([view]) => view) : [];
   }
 
+  // Views whose masks are to be looked at; that one mask alone bounds nothing is nobody's fault.
+  blamed(reflector) {
+    const alone = this.painted(reflector).length === 1 && !reflector.report?.problem?.found.includes(' is all ');
+    return alone ? [] : reflector?.report?.problem?.views ?? [];
+  }
+
   change(runs, reflector = this.reflector, view = this.view) {
     const before = this.runs(reflector, view);
     if (sameRuns(before, runs)) return;
