@@ -1,6 +1,6 @@
 """Shape annotations are enforced in every test; tests of the splatter run on each of its backends.
 
-`pytest --require cpu` fails instead of skipping where that backend is missing. `emulated`: the GPU's code on a CPU core.
+`pytest --require cpu` fails instead of skipping where that backend is missing; `emulated` is the GPU's code on a CPU.
 """
 
 import pytest
@@ -9,6 +9,9 @@ from jaxtyping import install_import_hook
 install_import_hook("catacaustics", "beartype.beartype")
 
 import splatter  # noqa: E402
+
+from catacaustics import splatting  # noqa: E402
+from catacaustics.splatting import library  # noqa: E402
 
 
 def pytest_addoption(parser):
@@ -22,6 +25,14 @@ def pytest_report_header():
     return [f"splatter {name}: {splatter.problem(name) or 'tested'}" for name in shown]
 
 
+def pytest_terminal_summary(terminalreporter):
+    if splatter.errors:
+        terminalreporter.section("splatter: largest errors against the reference in float64, hard cases included")
+    for (backend, dtype), seen in sorted(splatter.errors.items()):
+        figures = "  ".join(f"{name} {error:.0e}" for name, error in seen.items())
+        terminalreporter.write_line(f"{backend} {dtype}: {figures}")
+
+
 @pytest.fixture(params=splatter.BACKENDS)
 def backend(request, monkeypatch):
     """Splats with each backend in turn; returns its name."""
@@ -31,9 +42,10 @@ def backend(request, monkeypatch):
     if problem:
         pytest.skip(f"no {name} backend: {problem}")
     monkeypatch.setenv("CATACAUSTICS_SPLATTER", "cpu" if name == "emulated" else name)
+    monkeypatch.setattr(splatter.device, "backend", name)
     if name == "cuda":
         monkeypatch.setattr(splatter.device, "name", "cuda")
     if name == "emulated":
-        for module in (splatter.splatting, splatter.library):
+        for module in (splatting, library):
             monkeypatch.setattr(module, "find_library", lambda _: splatter.emulated_library())
     return name

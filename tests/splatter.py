@@ -7,8 +7,9 @@ import subprocess
 import tempfile
 from pathlib import Path
 
+import torch
+
 from catacaustics import splatting
-from catacaustics.splatting import library
 from catacaustics.splatting.library import Found, NativeError, find_library, load_library
 
 BACKENDS = ("reference", "cpu", "cuda", "emulated")
@@ -18,9 +19,18 @@ EMULATION = Path(__file__).parent / "cuda_emulation"
 
 class _Device:
     name = "cpu"
+    backend = ""
 
 
 device = _Device()
+errors: dict[tuple[str, str], dict[str, float]] = {}
+"""Largest errors seen: by backend and type, then by result; shares of the largest value."""
+
+
+def note_error(dtype: torch.dtype, result: str, error: float) -> None:
+    """Remember an error against the reference in float64, for the table that ends the tests."""
+    seen = errors.setdefault((device.backend, str(dtype).removeprefix("torch.")), {})
+    seen[result] = max(seen.get(result, 0.0), error)
 
 
 def splat_points(positions, normals, footprints, opacities, features, camera, *settings, **named):

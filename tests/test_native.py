@@ -3,12 +3,14 @@
 import math
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
 import pytest
+import splatter
 import torch
-from hypothesis import given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from splatter import splat_points
 from test_splatting import NAMES, front_camera, random_scene, weighted_sum
@@ -17,11 +19,11 @@ import catacaustics.splatting as splatting
 from catacaustics.cameras import Camera, Viewport
 from catacaustics.config import SplatConfig
 from catacaustics.errors import UserError
-from catacaustics.splatting import library, native
+from catacaustics.splatting import library, native, reference
 from catacaustics.splatting.library import NativeError, find_library, load_library
 
 # Largest difference from the reference in float64, as a share of the largest value of each result.
-TOLERANCE = {torch.float32: 1e-4, torch.float64: 1e-11}
+TOLERANCE = {torch.float32: 3e-5, torch.float64: 1e-12}
 # No pixel lies where rounding decides whether it is drawn.
 WIDE = SplatConfig(support=8.0)
 EVERYWHERE = [-1e9, -1e9, 1e9, 1e9]
@@ -54,9 +56,11 @@ def assert_like_reference(scene, camera, viewport=None, config=WIDE, scale=1.0):
     for name, expected in want.items():
         value = got.get(name, torch.zeros_like(expected))
         assert torch.isfinite(value).all(), name
-        allowed = scale * TOLERANCE[scene[0].dtype] * max(float(expected.abs().max()), 1e-30) if expected.numel() else 0
-        error = float((value - expected).abs().max()) if expected.numel() else 0
-        assert error <= allowed, f"{name}: off by {error:.2e}, allowed {allowed:.2e}"
+        if expected.numel():
+            error = float((value - expected).abs().max()) / max(float(expected.abs().max()), 1e-30)
+            splatter.note_error(scene[0].dtype, name, error)
+            allowed = scale * TOLERANCE[scene[0].dtype]
+            assert error <= allowed, f"{name}: off by {error:.2e} of the largest value, allowed {allowed:.2e}"
     return got
 
 
@@ -77,7 +81,13 @@ def pinhole(width, height=None, focal=10.0):
 
 
 @DTYPES
-@settings(max_examples=15, deadline=None, database=None, derandomize=True)
+@settings(
+    max_examples=15,
+    deadline=None,
+    database=None,
+    derandomize=True,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],  # the backend is the same for all examples
+)
 @given(
     n=st.integers(0, 120),
     channels=st.integers(1, 9),
@@ -85,21 +95,26 @@ def pinhole(width, height=None, focal=10.0):
     corner=st.tuples(st.integers(-40, 40), st.integers(-40, 40)),
     shape=st.tuples(st.integers(1, 75), st.integers(1, 75)),
     alpha_min=st.sampled_from([0.0, 1e-6]),
+    stop=st.sampled_from([0.0, 1e-4]),
     seed=st.integers(0, 1000),
 )
-@needs_native
-def test_random_scenes_look_as_in_the_reference(dtype, n, channels, size, corner, shape, alpha_min, seed):
+def test_random_scenes_look_as_in_the_reference(
+    backend, dtype, n, channels, size, corner, shape, alpha_min, stop, seed
+):
     scene = random_scene(n, channels, seed, dtype, size)
-    config = SplatConfig(support=8.0, alpha_min=alpha_min)
+    config = SplatConfig(support=8.0, alpha_min=alpha_min, stop_transmittance=stop)
     window = Viewport(*corner, *shape)
     camera = front_camera(60, 50, 60.0)
     want = results([t.double() for t in scene], camera, window, config, "reference")
-    got = results(scene, camera, window, config, "cpu")
+    got = results(scene, camera, window, config)
     for name, value in got.items():
         expected = want.get(name, torch.zeros_like(value))
         largest = max(float(expected.abs().max()), 1e-3) if expected.numel() else 0
-        # Cutting at a small alpha, rounding decides about pixels worth 1e-6.
-        torch.testing.assert_close(value, expected, rtol=0, atol=(TOLERANCE[dtype] + 10 * alpha_min) * largest)
+        if alpha_min == stop == 0 and expected.numel():
+            splatter.note_error(dtype, name, float((value - expected).abs().max()) / largest)
+        # With cut-offs, rounding decides about pairs on the border, which are worth as much as these.
+        atol = (TOLERANCE[dtype] + 10 * alpha_min + 10 * stop) * largest
+        torch.testing.assert_close(value, expected, rtol=0, atol=atol)
 
 
 @DTYPES
@@ -195,6 +210,8 @@ def test_centres_a_million_pixels_away_do_no_harm(backend, dtype):
     out = splat_points(*[t.requires_grad_() for t in scene], front_camera(), config=config)
     (out.image.sum() + out.transmittance.sum()).backward()
     assert all(torch.isfinite(t.grad).all() for t in scene)
+    if dtype == torch.float64:
+        assert_like_reference(scene, front_camera(), config=SplatConfig(support=8.0, guard_band=1e9), scale=100)
     scene[0].data[:20, 2] = -1
     alone = splat_points(*scene, front_camera(), config=config)
     if dtype == torch.float64:
@@ -250,8 +267,8 @@ def test_denormal_numbers_do_no_harm_and_the_callers_stay(backend):
 
 
 @DTYPES
-def test_an_opaque_wall_hides_many_points_and_still_feels_the_one_behind_it(backend, dtype):
-    n = 20_000
+def test_an_opaque_wall_hides_half_a_million_points_and_still_feels_the_one_behind_it(backend, dtype):
+    n = 500_000 if backend in ("cpu", "cuda") and dtype == torch.float32 else 20_000
     scene = random_scene(n, dtype=dtype, size=0.01)
     scene[0][:, 2] += 3
     wall = facing([2.0], 1.0, [[0.5, 0.5, 0.5]], footprint=1e12, dtype=dtype)
@@ -291,6 +308,17 @@ def test_large_features_do_not_drown_small_ones_beside_them(backend, dtype):
 
 
 @DTYPES
+def test_large_features_do_not_drown_the_gradients_of_small_ones(backend, dtype):
+    scene = random_scene(100, 2, dtype=dtype, size=0.1)
+    scene[4] = scene[4] * torch.tensor([1e4, 1e-4], dtype=dtype)
+    got = assert_like_reference(scene, front_camera())
+    want = results([t.double() for t in scene], front_camera(), None, WIDE, "reference")
+    for channel in range(2):
+        error = (got["features"] - want["features"])[:, channel].abs().max()
+        assert float(error) < TOLERANCE[dtype] * float(want["features"][:, channel].abs().max())
+
+
+@DTYPES
 def test_tensors_that_are_not_contiguous_are_taken_as_they_are(backend, dtype):
     scene = random_scene(40, 4, dtype=dtype, size=0.1)
     strided = [torch.stack([t, t], -1)[..., 0] for t in scene]
@@ -299,7 +327,70 @@ def test_tensors_that_are_not_contiguous_are_taken_as_they_are(backend, dtype):
     assert torch.equal(a.image, b.image)
 
 
+def disks(**changes):
+    return reference.Disks(*random_scene(6, dtype=torch.float32))._replace(**changes)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"normals": torch.zeros(5, 3)}, r"normals must have shape \(6, 3\), got \(5, 3\)"),
+        ({"footprints": torch.zeros(6, 1)}, r"footprints must have shape \(6,\), got \(6, 1\)"),
+        ({"features": torch.zeros(6)}, r"features must have shape \(6, 6\), got \(6,\)"),
+        ({"opacities": torch.zeros(6).double()}, "opacities must be float32 or float64 like positions, got .*float64"),
+        ({"positions": torch.zeros(6, 3).half()}, "positions must be float32 or float64"),
+        ({"normals": torch.zeros(6, 3, device="meta")}, "normals must be on cpu like positions, got meta"),
+    ],
+)
+def test_tensors_that_do_not_go_together_are_refused_by_name(changes, message):
+    with pytest.raises(ValueError, match=message):
+        reference.check_shapes(disks(**changes))
+
+
 # What only native code has.
+
+
+@needs_native
+def test_looking_for_values_that_are_not_finite_costs_less_than_2_percent():
+    scene = [t.requires_grad_() for t in random_scene(100_000, 8, dtype=torch.float32, size=0.005)]
+    camera, cpu = front_camera(600, 400, 600.0), find_library("cpu").library
+    values = torch.cat([t.detach().flatten() for t in scene])
+
+    def seconds(function):
+        times = []
+        for _ in range(5):
+            start = time.perf_counter()
+            function()
+            times.append(time.perf_counter() - start)
+        return min(times)
+
+    def step():
+        out = splat_points(*scene, camera, backend="cpu")
+        (out.image.sum() + out.transmittance.sum()).backward()
+
+    assert seconds(lambda: cpu.call("finite", values, values, len(values))) < 0.02 * seconds(step)
+
+
+@needs_native
+def test_a_function_that_splats_compiles_as_one_graph():
+    """In a process of its own: the checks of shapes that tests add cannot be traced."""
+    code = """
+import sys, torch
+sys.path.insert(0, sys.argv[1])
+from test_splatting import front_camera, random_scene
+from catacaustics.splatting import splat_points
+
+scene, camera = [t.requires_grad_() for t in random_scene(50, dtype=torch.float32, size=0.1)], front_camera()
+def loss(*scene):
+    out = splat_points(*scene, camera, backend="cpu")
+    return (out.image**2).sum() + out.transmittance.sum()
+
+torch._dynamo.config.capture_dynamic_output_shape_ops = True  # how many points are visible is known when it runs
+compiled = torch.compile(loss, fullgraph=True, backend="aot_eager")
+for a, b in zip(torch.autograd.grad(compiled(*scene), scene), torch.autograd.grad(loss(*scene), scene)):
+    torch.testing.assert_close(a, b)
+"""
+    subprocess.run([sys.executable, "-c", code, str(Path(__file__).parent)], check=True, timeout=200)
 
 
 @needs_native

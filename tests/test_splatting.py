@@ -62,8 +62,9 @@ def brute_force(positions, normals, footprints, opacities, features, camera, vie
     order = torch.argsort(z, stable=True)
     image, through = 0, torch.ones(pixels.shape[:2], dtype=p.dtype)
     for i in order.tolist():
-        image = image + (through * alpha[:, :, i])[..., None] * features[i]
-        through = through * (1 - alpha[:, :, i])
+        drawn = torch.where(through >= config.stop_transmittance, alpha[:, :, i], 0)
+        image = image + (through * drawn)[..., None] * features[i]
+        through = through * (1 - drawn)
     return image, through
 
 
@@ -73,11 +74,12 @@ def weighted_sum(image, transmittance):
     return (image * weights).sum() + (transmittance * (weights[..., 0] + 0.5)).sum()
 
 
+@pytest.mark.parametrize("stop", [0.0, 0.3])
 @pytest.mark.parametrize("budget", [10**9, 300])
-def test_image_and_every_gradient_agree_with_brute_force_whatever_the_memory_budget(budget):
-    config = SplatConfig(support=4.0, pair_budget=budget)
+def test_image_and_every_gradient_agree_with_brute_force_whatever_the_memory_budget(budget, stop):
+    config = SplatConfig(support=4.0, pair_budget=budget, stop_transmittance=stop)
     camera, viewport = front_camera(), Viewport(3, 2, 17, 13)
-    scene = [t.requires_grad_() for t in random_scene(60)]
+    scene = [t.requires_grad_() for t in random_scene(60, size=0.05)]
     out = splat_points(*scene, camera, viewport, config)
     expected = brute_force(*scene, camera, viewport, config)
     torch.testing.assert_close(out.image, expected[0], rtol=1e-10, atol=1e-12)
@@ -223,6 +225,33 @@ def test_a_small_pair_budget_gives_the_same_float32_image_as_an_ample_one():
     small = splat_points(*scene, camera, config=SplatConfig(pair_budget=20_000))
     ample = splat_points(*scene, camera, config=SplatConfig(pair_budget=10**8))
     torch.testing.assert_close(small.image, ample.image, rtol=1e-5, atol=1e-6)
+
+
+def test_early_stop_draws_nothing_behind_and_gradients_belong_to_that_image():
+    """T in front of each splat is 1, 1/2, 1/4, 1/8: with a stop of 1/4, three are drawn."""
+    camera = Camera(1, 1, 10.0, 10.0, 0.5, 0.5, np.eye(4))
+    positions = torch.tensor([[0.0, 0, z] for z in (2, 3, 4, 5)])
+    half = torch.full((4,), 0.5, requires_grad=True)
+    features = torch.tensor([[1.0], [10.0], [100.0], [1000.0]], requires_grad=True)
+    facing = torch.tensor([[0.0, 0, -1]]).expand(4, 3)
+    out = splat_points(
+        positions, facing, torch.full((4,), 1e-4), half, features, camera, config=SplatConfig(stop_transmittance=0.25)
+    )
+    assert out.image.item() == 0.5 + 10 / 4 + 100 / 8
+    assert out.transmittance.item() == 1 / 8
+    (out.image.sum() + 16 * out.transmittance.sum()).backward()
+    assert features.grad is not None
+    assert half.grad is not None
+    assert features.grad[:, 0].tolist() == [1 / 2, 1 / 4, 1 / 8, 0]
+    # T_i (c_i - R_i), where R is what is seen behind: 16, then half of it and half of each colour.
+    assert half.grad.tolist() == [1 - (5 + 29), (10 - 58) / 2, (100 - 16) / 4, 0]
+
+
+def test_the_presets_differ_in_the_cut_offs_alone():
+    assert SplatConfig.exact() == SplatConfig()
+    assert SplatConfig.fast(near=0.5) == SplatConfig(near=0.5, alpha_min=1 / 255, stop_transmittance=1e-4)
+    with pytest.raises(TypeError, match="alpha_mni"):
+        SplatConfig.fast(alpha_mni=0.1)
 
 
 def test_cut_off_at_small_alpha_changes_the_image_by_no_more_than_what_it_drops():

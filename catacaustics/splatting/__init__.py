@@ -5,6 +5,7 @@ import logging
 import os
 from typing import Literal, get_args
 
+import torch
 from torch import Tensor
 
 from catacaustics.cameras import Camera, Viewport
@@ -26,6 +27,7 @@ def _say_once(message: str) -> None:
     logging.getLogger("catacaustics").warning(message)
 
 
+@torch.compiler.assume_constant_result
 def backend_for(device: str, backend: Backend | None = None) -> str:
     """The backend that splats tensors of a device: `cpu`, `cuda` (native code) or `reference` (PyTorch).
 

@@ -253,7 +253,7 @@ splat_blend.register_autograd(_blend_gradients, setup_context=_save_blend)
 def splat(disks: Disks, camera: Camera, viewport: Viewport, config: SplatConfig) -> SplatOutput:
     """`splat_points` in native code. Raises NativeError where there is none for the tensors' device."""
     like = {"dtype": disks.positions.dtype, "device": disks.positions.device}
-    pose = torch.tensor(camera.camera_from_world, **like)
+    pose = torch.as_tensor(camera.camera_from_world, **like)
     lens = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], **like)
     band, width, height = config.guard_band, camera.width, camera.height
     guard = (-band * width, -band * height, (1 + band) * width, (1 + band) * height)

@@ -1,0 +1,119 @@
+"""The GPU's kernels where there is no GPU: compiled by NVIDIA's compiler, and run thread by thread on a CPU core.
+
+The parity tests of test_splatting.py and test_native.py run on the emulated kernels too (backend `emulated`).
+"""
+
+import re
+import shutil
+import subprocess
+
+import pytest
+import torch
+from splatter import KERNELS, emulated_library, splat_points
+from test_native import results
+from test_splatting import front_camera, random_scene
+
+from catacaustics.cameras import Viewport
+from catacaustics.config import SplatConfig
+from catacaustics.splatting import library
+
+NVCC = shutil.which("nvcc") or shutil.which("/usr/local/cuda/bin/nvcc")
+
+
+@pytest.fixture
+def emulated(monkeypatch):
+    """Splats with the emulated kernels."""
+    found = emulated_library()
+    if found.problem:
+        pytest.skip(found.problem)
+    monkeypatch.setattr(library, "find_library", lambda _: found)
+    return found.library
+
+
+def crowd(dtype=torch.float32):
+    """400 splats, small and large, in 3 x 3 tiles that are cut off by the viewport, several chunks in each."""
+    scene = random_scene(400, 7, dtype=dtype, size=0.05)
+    scene[2][::7] *= 100
+    return scene, front_camera(60, 50, 60.0), Viewport(5, 3, 41, 37)
+
+
+DETERMINISTIC = SplatConfig(alpha_min=1e-3, deterministic=True)
+
+
+@pytest.mark.skipif(not NVCC, reason="no CUDA compiler (nvcc)")
+def test_every_kernel_compiles_for_every_generation_of_gpus_and_keeps_its_sums_in_registers(tmp_path):
+    known = subprocess.run([NVCC, "--list-gpu-code"], capture_output=True, text=True, check=True).stdout.split()
+    archs = [arch for arch in ("80", "90", "100", "120") if f"sm_{arch}" in known]
+    assert "80" in archs
+    targets = [f"--generate-code=arch=compute_{arch},code=sm_{arch}" for arch in archs]
+    flags = [
+        "--fatbin",
+        "-std=c++17",
+        "--threads=0",
+        "-Xptxas=-v",
+        '-DCATACAUSTICS_ARCHS="all"',
+        "-odir",
+        str(tmp_path),
+    ]
+    sources = sorted(map(str, (KERNELS / "cuda").glob("*.cu")))
+    done = subprocess.run([NVCC, *flags, *targets, *sources], capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr[-3000:]
+    assert len(list(tmp_path.iterdir())) == len(sources)
+    # Of the kernels in float32 that training spends its time in.
+    frames = re.findall(r"Function properties for \S+(blend_\w+If\S+)\n\s*(\d+) bytes stack frame", done.stderr)
+    assert len(frames) >= 6 * len(archs)
+    assert not [name for name, stack in frames if int(stack) > 32]  # an array of sums takes 64 bytes or more
+
+
+@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
+def test_no_result_depends_on_the_order_in_which_threads_and_blocks_run(emulated, monkeypatch, dtype):
+    forward = results(*crowd(dtype), DETERMINISTIC, "cpu")
+    monkeypatch.setenv("EMULATED_ORDER", "reversed")
+    for name, value in results(*crowd(dtype), DETERMINISTIC, "cpu").items():
+        assert torch.equal(value, forward[name]), name
+
+
+def test_atomic_additions_give_the_gradients_of_the_ordered_ones(emulated):
+    ordered = results(*crowd(), DETERMINISTIC, "cpu")
+    for name, value in results(*crowd(), SplatConfig(alpha_min=1e-3), "cpu").items():
+        torch.testing.assert_close(value, ordered[name], rtol=0, atol=1e-5 * float(ordered[name].abs().max()))
+
+
+@pytest.mark.parametrize("settings", [{"deterministic": True}, {"stop_transmittance": 0.3}], ids=str)
+def test_kernels_write_all_that_they_read_and_stay_within_their_memory(emulated, monkeypatch, settings):
+    """All memory is handed out full of not-a-numbers, between fences."""
+    config = SplatConfig(alpha_min=1e-3, **settings)
+    expected = results(*crowd(), config, "cpu")
+    fenced, plain_empty = [], torch.empty
+
+    def empty(*size, **options):
+        if options.get("dtype") != torch.uint8:
+            return plain_empty(*size, **options)
+        fenced.append((torch.full((size[0] + 128,), 255, dtype=torch.uint8), size[0]))
+        return fenced[-1][0][64 : 64 + size[0]]
+
+    monkeypatch.setattr(torch, "empty", empty)
+    torch.use_deterministic_algorithms(True)  # fills torch's own new memory with not-a-numbers
+    try:
+        for name, value in results(*crowd(), config, "cpu").items():
+            torch.testing.assert_close(value, expected[name], rtol=0, atol=1e-5 * float(expected[name].abs().max()))
+    finally:
+        torch.use_deterministic_algorithms(False)
+    assert len(fenced) > 10
+    for memory, size in fenced:
+        assert memory[:64].eq(255).all()
+        assert memory[64 + size :].eq(255).all()
+
+
+def test_two_tiles_never_share_a_checkpoint():
+    """floor(b / c) - floor(a / c) + 1 rows are enough for the entries from a to b, c a row."""
+    a, b = torch.meshgrid(torch.arange(200), torch.arange(200), indexing="ij")
+    for chunk in (8, 16):
+        rows = torch.div(b, chunk, rounding_mode="floor") - torch.div(a, chunk, rounding_mode="floor") + 1
+        assert (rows * chunk >= b - a)[b >= a].all()
+
+
+def test_a_kernel_that_fails_is_an_error_and_not_the_end_of_the_process(emulated):
+    scene, camera, viewport = crowd()
+    with pytest.raises(ValueError, match=r"viewports of up to 2\^20 pixels"):
+        splat_points(*scene, camera, viewport._replace(width=2**21, height=1), backend="cpu")
