@@ -26,7 +26,7 @@ def _stereo() -> str:
     return "plane sweep in PyTorch (this pycolmap has no CUDA; a CUDA build would use COLMAP PatchMatch)"
 
 
-def _splat_self_test(backend: Literal["reference", "cpu"]) -> str:
+def _splat_self_test(backend: Literal["reference", "cpu", "cuda"]) -> str:
     """How a backend was built and its time for a small forward and backward pass, or what is wrong with it."""
     import time
 
@@ -37,24 +37,32 @@ def _splat_self_test(backend: Literal["reference", "cpu"]) -> str:
     from catacaustics.splatting import splat_points
     from catacaustics.splatting.library import find_library
 
-    built = "PyTorch"
-    if backend == "cpu":
+    built, device = "PyTorch", "cpu"
+    if backend != "reference":
+        device = backend
         library, problem = find_library(backend)
         if library is None:
             return f"not available: {problem}"
         built = library.description
     generator = torch.Generator().manual_seed(0)
     positions = torch.rand(2000, 3, generator=generator) + torch.tensor([-0.5, -0.5, 1.0])
-    positions.requires_grad_()
-    normals = torch.tensor([0.0, 0.0, -1.0]).expand(2000, 3)
-    camera = Camera(160, 120, 120.0, 120.0, 80.0, 60.0, np.eye(4))
-    values = torch.full((2000,), 1e-4), torch.full((2000,), 0.5), torch.ones(2000, 3)
-    splat_points(positions, normals, *values, camera, backend=backend).image.sum().backward()  # warm up
-    start = time.perf_counter()
-    output = splat_points(positions, normals, *values, camera, backend=backend)
-    output.image.sum().backward()
-    seconds = time.perf_counter() - start
-    total = float(output.image.detach()[..., 0].mean() + output.transmittance.detach().mean())
+    positions = positions.to(device).requires_grad_()
+    normals = torch.tensor([0.0, 0.0, -1.0], device=device).expand(2000, 3)
+    one, camera = torch.ones(2000, 3, device=device), Camera(160, 120, 120.0, 120.0, 80.0, 60.0, np.eye(4))
+
+    def splat() -> float:
+        """Features are 1 and the background is black: image and transmittance add up to 1."""
+        output = splat_points(positions, normals, 1e-4 * one[:, 0], 0.5 * one[:, 0], one, camera, backend=backend)
+        output.image.sum().backward()
+        return float(output.image.detach()[..., 0].mean() + output.transmittance.detach().mean())
+
+    try:
+        splat()  # warm up
+        start = time.perf_counter()
+        total = splat()
+        seconds = time.perf_counter() - start
+    except Exception as error:  # a report goes on
+        return f"FAILED ({built}): {error}"
     if abs(total - 1) > 1e-4 or positions.grad is None or not torch.isfinite(positions.grad).all():
         return f"FAILED ({built}): opacity and transmittance add up to {total:.6f} instead of 1"
     return f"ok ({built}), {1000 * seconds:.0f} ms forward and backward (2000 splats, 160 x 120)"
@@ -74,6 +82,7 @@ def doctor(config: DoctorConfig) -> None:
         ("free disk here", f"{shutil.disk_usage('.').free / 2**30:.0f} GiB"),
         ("splatter: reference", _splat_self_test("reference")),
         ("splatter: cpu", _splat_self_test("cpu")),
+        ("splatter: cuda", _splat_self_test("cuda")),
         ("multi-view stereo", _stereo()),
     ]
     packages = ["torch", "numpy", "scipy", "pycolmap", "open3d", "opencv-contrib-python-headless", "torchmetrics"]
