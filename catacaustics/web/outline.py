@@ -155,7 +155,7 @@ def _by_color(picture: np.ndarray, scribble: np.ndarray) -> np.ndarray:
         return np.zeros_like(hull)
     cv2.setRNGSeed(0)  # it starts from k-means with random centres
     models = np.zeros((1, 65)), np.zeros((1, 65))
-    cv2.grabCut(np.ascontiguousarray(picture), labels, None, *models, 4, cv2.GC_INIT_WITH_MASK)
+    cv2.grabCut(np.ascontiguousarray(picture), labels, (0, 0, 1, 1), *models, 4, cv2.GC_INIT_WITH_MASK)
     return _tidy(np.isin(labels, (cv2.GC_FGD, cv2.GC_PR_FGD)), core, smooth=0.05 * radius)
 
 

@@ -190,13 +190,19 @@ export class Painting extends EventTarget {
   }
 
   async saveAll() {
-    if (this.unnoted && !(await this.attempt(() => this.note()))) return;
+    if (await this.trySaving()) return;
+    if (!this.problem.status) return;
+    // The server runs, but cannot write: it can still say what the masks make.
+    for (const reflector of new Set(this.unsaved().map((u) => u.reflector))) await this.refresh(reflector);
+  }
+
+  async trySaving() {
+    if (this.unnoted && !(await this.attempt(() => this.note()))) return false;
     let next;
     while ((next = this.unsaved().find(({ mask }) => !mask.conflict))) {
-      if (await this.attempt(() => this.saveMask(next.reflector, next.view, next.mask))) continue;
-      if (this.problem.status) await this.refresh(next.reflector);
-      return;
+      if (!(await this.attempt(() => this.saveMask(next.reflector, next.view, next.mask)))) return false;
     }
+    return true;
   }
 
   // Wait until nothing is being saved; throws where something cannot be.

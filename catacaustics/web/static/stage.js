@@ -106,8 +106,10 @@ export class Stage extends EventTarget {
     this.ratio = window.devicePixelRatio || 1;
     this.canvas.width = Math.round(width * this.ratio);
     this.canvas.height = Math.round(height * this.ratio);
+    const before = this.room;
     this.room = { width, height };
-    this.fit();
+    if (this.zoomed && before) this.pan((width - before.width) / 2, (height - before.height) / 2);
+    else this.fit();
   }
 
   fit() {
