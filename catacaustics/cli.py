@@ -11,9 +11,9 @@ _COMMANDS = {
     "reconstruct": ("catacaustics.reconstruct", "reconstruct", "ReconstructConfig"),
     "calibrate": ("catacaustics.capture.calibrate", "calibrate", "CalibrateConfig"),
     "mask": ("catacaustics.web.server", "mask", "MaskConfig"),
-    "mask": ("catacaustics.web.server", "mask", "MaskConfig"),
     "train": ("catacaustics.training.train", "train", "TrainConfig"),
     "evaluate": ("catacaustics.evaluation", "evaluate", "EvaluateConfig"),
+    "ablate": ("catacaustics.ablation", "ablate", "AblateConfig"),
     "render": ("catacaustics.video", "render_video", "RenderConfig"),
     "doctor": ("catacaustics.doctor", "doctor", "DoctorConfig"),
 }
@@ -49,9 +49,6 @@ def main(arguments: list[str] | None = None) -> int:
 
     module, function, name = _COMMANDS[command]
     config_type = getattr(importlib.import_module("catacaustics.config"), name)
-    for field in [f for f in config_type.__annotations__ if f.endswith("_")]:  # import_: the name is a Python keyword
-        kind = config_type.__annotations__[field]
-        config_type.__annotations__[field] = Annotated[kind, tyro.conf.arg(name=field.removesuffix("_"))]
     for field in [f for f in config_type.__annotations__ if f.endswith("_")]:  # import_: the name is a Python keyword
         kind = config_type.__annotations__[field]
         config_type.__annotations__[field] = Annotated[kind, tyro.conf.arg(name=field.removesuffix("_"))]

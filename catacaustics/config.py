@@ -103,8 +103,9 @@ class TrainConfig:
     warp_width: int = 256
     renderer_width: int = 32
     renderer_layers: int = 9
-    densify_every: int = 2000
-    """Steps between densifications of the primary cloud; 0 switches it off."""
+    densifications: int = 10
+    """Times that the primary cloud is densified, evenly from the end of the warm-up to 80 % of the training (paper:
+    every 2000 steps)."""
     densify_share: float = 0.05
     """Share of the points, those with the highest view-space gradients, that spawn a point each time."""
     weight_l1: float = 0.05
@@ -129,6 +130,31 @@ class TrainConfig:
     warp_weight_decay: float = 1e-2
     checkpoint_minutes: float = 2.0
     seed: int = 0
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+
+
+@dataclass(frozen=True)
+class AblateConfig:
+    """Measure what each part is worth: the paper's ablations and every rung, at equal time and equal iterations."""
+
+    capture: Path
+    """Folder made by `catacaustics calibrate`."""
+    out: Path
+    """Folder to write: ablation.json, ablation.html; finished rows found there are kept."""
+    minutes: float | None = 1.0
+    """Training time of each row in the comparison at equal time; None leaves it out."""
+    iterations: int | None = None
+    """Steps of each row in the comparison at equal iterations; None leaves it out."""
+    rows: tuple[str, ...] = ()
+    """Names of the rows to train; none named means all."""
+    cloud_rungs: tuple[Model, ...] = ("sphere",)
+    """Rungs that are also trained with a quarter and with half of the usual reflection points."""
+    seeds: tuple[int, ...] = (0,)
+    """One training a seed; the table gives means and spreads."""
+    image_size: int = 480
+    """Longer side of the photographs in training."""
+    json: Path | None = None
+    """Write the results to this file too."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
 
 
@@ -202,21 +228,6 @@ class ReconstructConfig:
     """Width of the neural warp's hidden layers (paper: 256); 128 trains twice as many steps a minute on a CPU."""
     seed: int = 0
     device: Literal["auto", "cpu", "cuda"] = "auto"
-
-
-@dataclass(frozen=True)
-class MaskConfig:
-    """Paint the masks of reflectors in the browser, and see at once what volume they make."""
-
-    capture: Path
-    """Folder made by `catacaustics calibrate`."""
-    import_: Path | None = None
-    """Take masks made with any editor, FOLDER/REFLECTOR/STEM.png at the size of the capture's photographs, and exit.
-    They replace all masks of those reflectors; the old ones are kept in removed_masks/."""
-    browser: bool = True
-    """Open the page in the browser; its address is printed in any case."""
-    port: int = 8642
-    """Port on 127.0.0.1; where it is in use, any free one is taken."""
 
 
 @dataclass(frozen=True)

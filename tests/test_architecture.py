@@ -34,6 +34,8 @@ FLOORS = [
     "training",
     "report",
     "evaluation",
+    "catacaustic",
+    "ablation",
     "video",
     "reconstruct",
     "web",

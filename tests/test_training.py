@@ -40,7 +40,7 @@ def small(capture_path, run, **options):
         "reflection_points": 300,
         "environment_width": 20,
         "warp_width": 32,
-        "densify_every": 20,
+        "densifications": 2,
         "image_size": 64,
         "patch": 40,
     }
@@ -182,7 +182,7 @@ def test_rows_follow_adam_and_stand_still_while_they_have_no_gradient():
 
 
 def test_densification_spawns_downhill_keeps_moments_and_respects_the_cap(capture_path, tmp_path):
-    scene = train(small(capture_path, tmp_path / "run", iterations=4, densify_every=0))
+    scene = train(small(capture_path, tmp_path / "run", iterations=4, densifications=0))
     optimizer = make_optimizer(scene, small(capture_path, tmp_path))
     n = len(scene.primary)
     for group in optimizer.param_groups:

@@ -2,6 +2,7 @@
 
 import json
 import time
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NamedTuple
@@ -46,6 +47,12 @@ class Stage(NamedTuple):
 STAGES = (Stage(0.05, 0.25, 1 / 32), Stage(0.15, 0.5, 1 / 6), Stage(1.0, 1.0, 1.0))
 """Multi-resolution warm-up: from 1/4 resolution and 1 point in 32, doubled twice (paper section 5.2)."""
 
+_WARM, _DENSIFIED = STAGES[-2].end, 0.8
+"""Shares of the training between which the primary cloud is densified."""
+
+PROBES = (0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
+Probe = Callable[[Scene, float, int], None]
+
 
 @dataclass
 class TrainState:
@@ -60,10 +67,14 @@ class TrainState:
     stage: int = 0
     queue: list[int] = field(default_factory=list)
     gradient_norm: float = 0.0
+    densified: int = 0
 
 
-def fit(capture: Capture, reflectors: list[Reflector], config: TrainConfig) -> Scene:
+def fit(capture: Capture, reflectors: list[Reflector], config: TrainConfig, probe: Probe | None = None) -> Scene:
     """Train a scene of known models; writes RUN/scene.safetensors and keeps RUN/checkpoint.safetensors while at it.
+
+    Args:
+        probe: called with scene, seconds and steps at the shares PROBES of the training; its time does not count.
 
     Raises:
         UserError: a value that is not finite.
@@ -78,7 +89,7 @@ def fit(capture: Capture, reflectors: list[Reflector], config: TrainConfig) -> S
     seeds += [reflection_seeds(capture, r, config, rng) for r in reflectors]
     state = _start(capture, reflectors, seeds, config, rng)
     try:
-        _loop(state, capture, [r.volume for r in reflectors], seeds, config)
+        _loop(state, capture, [r.volume for r in reflectors], seeds, config, probe)
     except KeyboardInterrupt:
         save_checkpoint(run, state)
         print(f"training: interrupted at step {state.step}, checkpoint saved; go on with --resume")
@@ -115,7 +126,7 @@ def _start(
     rng.bit_generator.state = notes["rng"]
     _trim_log(Path(config.run), notes["step"])
     print(f"training: going on from step {notes['step']}")
-    place = (notes[key] for key in ("step", "seconds", "stage", "queue", "gradient_norm"))
+    place = (notes[key] for key in ("step", "seconds", "stage", "queue", "gradient_norm", "densified"))
     return TrainState(scene, optimizer, rng, statistics, *place)
 
 
@@ -127,6 +138,7 @@ def save_checkpoint(run: Path, state: TrainState) -> None:
         "stage": state.stage,
         "queue": state.queue,
         "gradient_norm": state.gradient_norm,
+        "densified": state.densified,
         "rng": state.rng.bit_generator.state,
     }
     extra = {f"statistics.{name}": value for name, value in vars(state.statistics).items()}
@@ -147,12 +159,18 @@ def _progress(state: TrainState, config: TrainConfig) -> float:
 
 
 def _loop(
-    state: TrainState, capture: Capture, volumes: list[ReflectionVolume], seeds: list[Seeds], config: TrainConfig
+    state: TrainState,
+    capture: Capture,
+    volumes: list[ReflectionVolume],
+    seeds: list[Seeds],
+    config: TrainConfig,
+    probe: Probe | None,
 ) -> None:
     run = Path(config.run)
     photographs = PhotographCache(capture)
     extent = scene_extent(capture)
     started, saved = time.monotonic() - state.seconds, time.monotonic()
+    probed = sum(_progress(state, config) >= share for share in PROBES)
     layout = "{desc}: {percentage:3.0f}% |{bar}| {elapsed}, {remaining} left{postfix}"
     start = int(1000 * _progress(state, config))
     bar = tqdm(total=1000, initial=start, desc="training", mininterval=1.0, bar_format=layout)
@@ -164,10 +182,15 @@ def _loop(
             set_rates(state.optimizer, config, extent, progress, warm_up)
             record = _step(state, capture, volumes, photographs, stage, config)
             state.step += 1
-            if config.densify_every and not warm_up and state.step % config.densify_every == 0 and progress < 0.8:
+            if int(config.densifications * min(1.0, (progress - _WARM) / (_DENSIFIED - _WARM))) > state.densified:
                 densify(state.scene, state.optimizer, state.statistics, config.densify_share, config.max_primary_points)
                 state.statistics = GradientStatistics(len(state.scene.primary), state.scene.device)
+                state.densified += 1
             state.seconds = time.monotonic() - started
+            if probe is not None and _progress(state, config) >= PROBES[min(probed, len(PROBES) - 1)]:
+                probe(state.scene, state.seconds, state.step)
+                started = time.monotonic() - state.seconds
+                probed = sum(_progress(state, config) >= share for share in PROBES)
             if state.step % _LOG_EVERY == 0:
                 log.write(json.dumps(_log_row(state, stage, record)) + "\n")
                 log.flush()
