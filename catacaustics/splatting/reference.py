@@ -276,17 +276,19 @@ class _Blend(torch.autograd.Function):
         return image, transmittance
 
     @staticmethod
-    def backward(ctx, g_image, g_transmittance):
+    def backward(ctx, g_image, g_transmittance):  # pyright: ignore[reportIncompatibleMethodOverride]
         means, forms, opacities, features, reach2 = ctx.saved_tensors
         grads = [torch.zeros_like(t) for t in (means, forms, opacities, features)]
         for (region, index), kept in zip(ctx.regions, ctx.kept, strict=True):
             if kept is None:
                 pairs = _list_pairs(means[index], forms[index], opacities[index], reach2[index], region)
-                kept = _transmittances(pairs, region.width * region.height, ctx.stop)[:2]
+                pairs, before, _ = _transmittances(pairs, region.width * region.height, ctx.stop)
+            else:
+                pairs, before = kept
             rows, columns = _window(region, ctx.viewport)
             g = g_image[rows, columns].reshape(-1, g_image.shape[-1])
             g_out = g_transmittance[rows, columns].reshape(-1)
-            parts = _backward_region(*kept, forms[index], features[index], g, g_out)
+            parts = _backward_region(pairs, before, forms[index], features[index], g, g_out)
             for grad, part in zip(grads, parts, strict=True):
                 grad.index_add_(0, index, part)
         return *grads, None, None, None, None, None
@@ -355,8 +357,8 @@ def splat(disks: Disks, camera: Camera, viewport: Viewport, config: SplatConfig)
     lens = ((camera.fx, camera.fy), (camera.cx, camera.cy))
     with torch.no_grad():
         candidates = torch.nonzero(_in_guard_band(positions, pose, camera, config))[:, 0]
-        chosen = (t.index_select(0, candidates) for t in (positions, normals, footprints))
-        rough = project(*chosen, pose, *lens, config.low_pass)
+        near = [t.index_select(0, candidates) for t in (positions, normals, footprints)]
+        rough = project(near[0], near[1], near[2], pose, *lens, config.low_pass)
         reach2 = _reach2(opacities[candidates], config)
         reach = rough.half_extent * reach2.sqrt()[:, None]
         low = torch.tensor([viewport.x0, viewport.y0]).to(positions)
