@@ -14,6 +14,7 @@ _COMMANDS = {
     "train": ("catacaustics.training.train", "train", "TrainConfig"),
     "evaluate": ("catacaustics.evaluation", "evaluate", "EvaluateConfig"),
     "ablate": ("catacaustics.ablation", "ablate", "AblateConfig"),
+    "view": ("catacaustics.web.viewer", "view", "ViewConfig"),
     "render": ("catacaustics.video", "render_video", "RenderConfig"),
     "doctor": ("catacaustics.doctor", "doctor", "DoctorConfig"),
 }

@@ -246,5 +246,23 @@ class MaskConfig:
 
 
 @dataclass(frozen=True)
+class ViewConfig:
+    """Walk through a trained scene, or one in training, in the browser."""
+
+    run: Path
+    """Folder that training wrote, or writes."""
+    capture: Path | None = None
+    """The capture, where it is no longer at the place that training noted."""
+    image_size: int = 1000
+    """Longer side of a picture in pixels when the camera stands still."""
+    browser: bool = True
+    """Open the page in the browser; its address is printed in any case."""
+    port: int = 8643
+    """Port on 127.0.0.1; where it is in use, the next free one is taken."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Where to render; auto takes the GPU if there is one."""
+
+
+@dataclass(frozen=True)
 class DoctorConfig:
     """What is installed, what it can do here, and what would make it faster."""

@@ -20,12 +20,19 @@ class Run(NamedTuple):
     config: dict[str, Any]
 
 
-def open_run(folder: Path, capture: Path | None = None, device: str = "auto") -> Run:
+def scene_file(folder: Path, unfinished: bool = False) -> Path:
+    """The file of a run's scene; where training has not finished and `unfinished` is allowed, its last checkpoint."""
+    path, checkpoint = Path(folder) / "scene.safetensors", Path(folder) / "checkpoint.safetensors"
+    return checkpoint if unfinished and checkpoint.is_file() and not path.is_file() else path
+
+
+def open_run(folder: Path, capture: Path | None = None, device: str = "auto", unfinished: bool = False) -> Run:
     """Open a run's scene and capture.
 
     Args:
         capture: the capture's folder, where it is not the one that config.json names.
         device: "cpu", "cuda", or "auto": the GPU if there is one.
+        unfinished: take the last checkpoint where training has not finished.
 
     Raises:
         UserError: training has not finished, its config.json is missing or damaged, or the capture is gone.
@@ -33,14 +40,14 @@ def open_run(folder: Path, capture: Path | None = None, device: str = "auto") ->
     import torch
 
     folder = Path(folder)
-    path = folder / "scene.safetensors"
+    path = scene_file(folder, unfinished)
     if not path.is_file():
-        unfinished = (folder / "checkpoint.safetensors").is_file()
+        started = (folder / "checkpoint.safetensors").is_file()
         raise UserError(
-            f"There is no scene {path}" + (", only a checkpoint: training has not finished." if unfinished else "."),
+            f"There is no scene {path}" + (", only a checkpoint: training has not finished." if started else "."),
             "the folder of a finished training run",
             "go on with `catacaustics train ... --resume`"
-            if unfinished
+            if started
             else "run `catacaustics train`, or check the path",
         )
     config = read_json(folder / "config.json")

@@ -52,8 +52,7 @@ def mask(config: MaskConfig) -> None:
         token = secrets.token_urlsafe(16)
         address = f"http://127.0.0.1:{port}/{token}/"
         print(f"Mask painter for {capture.root}:\n\n    {address}\n", flush=True)
-        screen = sys.platform in ("darwin", "win32") or "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
-        if config.browser and screen:
+        if config.browser and has_screen():
             threading.Timer(0.5, webbrowser.open, [address]).start()
         else:
             print(f"From another machine: ssh -N -L {port}:127.0.0.1:{port} THIS_MACHINE, then open the address there.")
@@ -63,12 +62,18 @@ def mask(config: MaskConfig) -> None:
             log_level="warning",
             access_log=False,
             server_header=False,
+            ws="none",
             timeout_graceful_shutdown=2,
         )
         try:
             uvicorn.Server(settings).run(sockets=[listener])
         except KeyboardInterrupt:
             print(f"\nStopped. The masks are in {capture.root / 'masks'}")
+
+
+def has_screen() -> bool:
+    """Whether a browser can be opened here; without a screen some systems would open one in the terminal."""
+    return sys.platform in ("darwin", "win32") or "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
 
 
 def _listen(port: int) -> socket.socket:

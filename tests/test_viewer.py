@@ -1,0 +1,141 @@
+"""The viewer: its cameras, and that a browser sees what `render` makes."""
+
+import shutil
+import socket
+import time
+
+import numpy as np
+import pytest
+import torch
+import viser
+from stand_in import make_run
+from toy import make_toy_capture
+
+from catacaustics.capture.dataset import open_capture
+from catacaustics.config import TrainConfig
+from catacaustics.errors import UserError
+from catacaustics.images import read_image, read_image_bytes
+from catacaustics.reflectors.volume import build_volume
+from catacaustics.run import open_run
+from catacaustics.training.initialize import Reflector, initial_scene, primary_seeds, reflection_seeds
+from catacaustics.web.viewer import Viewer, _quaternion, shifted_camera, window_camera
+
+CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    return open_capture(make_toy_capture(tmp_path_factory.mktemp("capture"), width=128, height=96))
+
+
+@pytest.fixture(scope="module")
+def scene(capture):
+    config = TrainConfig(capture.root, capture.root, primary_points=3000, reflection_points=300, environment_width=20)
+    reflector, rng = Reflector(build_volume(capture, "ball"), "sphere"), np.random.default_rng(0)
+    seeds = [primary_seeds(capture, [reflector], config, rng), reflection_seeds(capture, reflector, config, rng)]
+    torch.manual_seed(0)
+    return initial_scene(capture, [reflector], seeds, 1.0, config)
+
+
+def test_a_window_that_stands_where_a_photograph_was_taken_has_its_camera(capture):
+    for shown in capture.views:
+        camera = shown.camera
+        pose = camera.camera_from_world[:3, :3].T
+        fov = 2 * np.arctan(camera.height / 2 / camera.fy)
+        made = window_camera(_quaternion(pose), camera.center, fov, camera.width, camera.height)
+        np.testing.assert_allclose(made.camera_from_world, camera.camera_from_world, atol=1e-12)
+        np.testing.assert_allclose(made.intrinsics, camera.intrinsics)
+
+
+def test_a_shifted_camera_moves_along_its_own_axes(capture):
+    camera = capture.views[0].camera
+    moved = shifted_camera(camera, np.array([0.1, 0.2, 0.3]))
+    local = camera.camera_from_world[:3, :3] @ (moved.center - camera.center)
+    np.testing.assert_allclose(local, [0.1, 0.2, 0.3])
+    assert np.array_equal(moved.camera_from_world[:3, :3], camera.camera_from_world[:3, :3])
+
+
+def test_a_run_in_training_is_opened_at_its_last_checkpoint_only_where_that_is_wanted(capture, scene, tmp_path):
+    run = make_run(tmp_path / "run", capture)
+    (run / "scene.safetensors").unlink()
+    scene.save(run / "checkpoint.safetensors", {"step": torch.zeros(1)})
+    with pytest.raises(UserError, match="training has not finished"):
+        open_run(run)
+    opened = open_run(run, device="cpu", unfinished=True)
+    assert len(opened.scene.primary) == len(scene.primary)
+
+
+@pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine: apt-get install chromium (as .ci/run does)")
+def test_a_browser_shows_the_frame_that_render_makes(capture, scene, tmp_path):
+    """The picture goes through JPEG and is stretched to the window, so it is compared smoothed."""
+    import cv2
+
+    sync_api = pytest.importorskip("playwright.sync_api", reason="no playwright: pip install playwright")
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    server = viser.ViserServer(host="127.0.0.1", port=port, verbose=False)
+    viewer = Viewer(server, scene, capture, tmp_path, 480)
+    arguments = ["--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+
+    def settled(previous: str = "") -> str:
+        deadline = time.monotonic() + 30
+        while "at 480 x 300" not in viewer.status.content or viewer.status.content == previous:
+            assert time.monotonic() < deadline
+            page.wait_for_timeout(50)
+        page.wait_for_timeout(700)
+        return viewer.status.content
+
+    def seen() -> np.ndarray:
+        path = tmp_path / "page.png"
+        page.screenshot(path=path)
+        return read_image(path)[:, 320:600]  # between the browser's messages and the controls
+
+    def smooth(image: np.ndarray) -> np.ndarray:
+        return cv2.GaussianBlur(np.float32(image), (0, 0), 3)
+
+    def expected(camera, warp=None) -> np.ndarray:
+        image = scene.render(camera, warp_camera=warp).rgb.numpy()
+        return cv2.resize(image, (960, 600), interpolation=cv2.INTER_LINEAR)[:, 320:600]
+
+    try:
+        with sync_api.sync_playwright() as playwright:
+            browser = playwright.chromium.launch(executable_path=CHROMIUM, args=arguments)
+            page = browser.new_page(viewport={"width": 960, "height": 600})
+            requests = []
+            page.on("request", lambda request: requests.append(request.url))
+            page.goto(f"http://127.0.0.1:{port}/")
+            deadline = time.monotonic() + 30
+            while not viewer.windows:
+                assert time.monotonic() < deadline
+                page.wait_for_timeout(50)
+            settled()
+            window = next(iter(viewer.windows.values()))
+            camera = window.camera(480)
+            np.testing.assert_allclose(camera.center, capture.views[0].camera.center, atol=1e-4)
+            error = np.mean((smooth(seen()) - smooth(expected(camera))) ** 2)
+            assert -10 * np.log10(error) > 35
+            apart = np.mean(
+                (smooth(expected(capture.views[3].camera.resized(480, 300))) - smooth(expected(camera))) ** 2
+            )
+            assert -10 * np.log10(apart) < 25  # another view would not have passed
+
+            page.get_by_role("button", name="Save picture").click()
+            saved = tmp_path / "pictures" / "001.png"
+            while not saved.is_file():
+                page.wait_for_timeout(50)
+            picture = scene.render(camera).rgb.numpy()
+            assert np.abs(read_image_bytes(saved) / 255 - picture).max() < 0.01
+
+            page.get_by_role("button", name="Freeze here").click()
+            viewer._go(window.client, 3)
+            page.wait_for_timeout(1500)
+            settled()
+            assert viewer.warp.value == "frozen"
+            turned = window.camera(480)
+            np.testing.assert_allclose(viewer.warp_camera(turned).center, camera.center, atol=1e-4)
+            error = np.mean((smooth(seen()) - smooth(expected(turned, camera))) ** 2)
+            assert -10 * np.log10(error) > 35
+            assert all(url.startswith((f"http://127.0.0.1:{port}/", "data:", "blob:")) for url in requests)
+            browser.close()
+    finally:
+        server.stop()
