@@ -157,11 +157,22 @@ def test_100000_splats_over_one_pixel_add_up(backend):
     assert float(scene[3].grad.sum()) == pytest.approx(-n * through / (1 - alpha), rel=tolerance)
 
 
-@DTYPES
-def test_a_tile_with_more_pairs_than_are_held_at_a_time_has_the_same_gradients(backend, dtype):
+@pytest.mark.parametrize(
+    ("dtype", "stop"), [(torch.float32, 0.0), (torch.float64, 0.0), (torch.float64, 0.9), (torch.float64, 0.3)]
+)
+def test_a_tile_with_more_pairs_than_are_held_at_a_time_has_the_same_gradients(backend, dtype, stop):
     scene = random_scene(1500, 2, dtype=dtype, size=0.6)
     scene[3] = 0.01 * scene[3]
-    assert_like_reference(scene, front_camera(), scale=3)
+    assert_like_reference(scene, front_camera(), config=SplatConfig(support=8.0, stop_transmittance=stop), scale=3)
+
+
+def test_early_stop_at_any_depth_of_a_tile_leaves_gradients_as_they_are(backend):
+    """Wherever it falls among the groups, chunks and batches in which splats are taken."""
+    scene = random_scene(700, 1, dtype=torch.float64, size=0.6)
+    scene[3] = torch.full_like(scene[3], 0.02)
+    for stop in (0.99, 0.7, 0.5, 0.3, 0.15, 0.1, 0.05, 0.02, 0.01):
+        config = SplatConfig(support=8.0, stop_transmittance=stop)
+        assert_like_reference(scene, pinhole(16, focal=16.0), config=config, scale=3)
 
 
 @DTYPES

@@ -44,6 +44,7 @@ struct BackwardTile {
     alignas(64) S through[Shape::blocks][Shape::lanes];
     StoredPairs pairs[kStored];
     uint8_t blocks[kStored + kSpare];
+    LiveBlocks<S> live;
     std::vector<int> starts;  // of an entry's pairs
     std::vector<Checkpoint> checkpoints;
 
@@ -53,13 +54,18 @@ struct BackwardTile {
         starts.clear();
         starts.push_back(0);
         int stored = 0;
-        while (from < count && stored + kGroup * Shape::blocks <= kStored) {
+        // Without early stop all count: the gradient of an opaque splat is the difference that it makes.
+        live.set_all();
+        for (const int64_t first = from; from < count && stored + kGroup * Shape::blocks <= kStored;) {
+            if (stop > S(0) && (from - first) % LiveBlocks<S>::kEvery == 0) live.update(through, stop);
+            if (live.none()) break;
             const int64_t end = std::min(count, from + kGroup);
             int listed = stored;
             for (int64_t entry = from; entry < end; ++entry) {
                 if (entry + kGroup < count) prefetch_record(bins.record(entries[entry + kGroup]), C);
                 const Record<S>& record = *reinterpret_cast<const Record<S>*>(bins.record(entries[entry]));
-                listed += list_blocks(at, record, tile_x - record.mean_x, tile_y - record.mean_y, blocks + listed);
+                uint8_t* own = blocks + listed;
+                listed += live.keep(own, list_blocks(at, record, tile_x - record.mean_x, tile_y - record.mean_y, own));
                 starts.push_back(listed);
             }
             const int* ends = starts.data() + starts.size() - (end - from);
@@ -91,9 +97,7 @@ struct BackwardTile {
             checkpoints.back().entry = entry;
             std::memcpy(checkpoints.back().through, through, sizeof through);
             entry = sweep(bins, entries, entry, count, tile_x, tile_y, stop);
-            // Splats behind are drawn nowhere. (Without early stop they still count: the gradient of an opaque splat is
-            // the difference that it makes.)
-            if (stop > S(0) && opaque(through, stop)) {
+            if (live.none()) {  // splats behind are drawn nowhere
                 std::memset(out + entry * gradient_stride(C), 0, (count - entry) * gradient_stride(C) * sizeof(S));
                 count = entry;
             }
@@ -101,7 +105,7 @@ struct BackwardTile {
         int64_t end = count;
         for (std::size_t k = checkpoints.size(); k-- > 0;) {
             const int64_t begin = checkpoints[k].entry;
-            if (end < count) {
+            if (k + 1 < checkpoints.size()) {  // the store holds the pairs of the last one
                 std::memcpy(through, checkpoints[k].through, sizeof through);
                 sweep(bins, entries, begin, end, tile_x, tile_y, stop);
             }

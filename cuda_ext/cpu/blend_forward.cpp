@@ -15,22 +15,26 @@ struct ForwardTile {
     LaneCoordinates<S> at;
     alignas(64) S image[Shape::blocks][C > 0 ? C : 1][Shape::lanes];
     alignas(64) S through[Shape::blocks][Shape::lanes];
+    LiveBlocks<S> live;
     uint8_t blocks[kGroup * Shape::blocks + kSpare];
     int ends[kGroup];
 
     void blend(const Bins<S>& bins, int64_t tile, S tile_x, S tile_y, S stop) {
         std::memset(image, 0, sizeof image);
         for (auto& block : through) P(S(1)).store(block);
+        live.set_all();
         const int32_t* entries = bins.begin(tile);
         const int64_t count = bins.end(tile) - entries;
         for (int64_t first = 0; first < count; first += kGroup) {
-            if ((first & 127) == 112 && opaque(through, stop)) return;
+            if (first > 0 && first % LiveBlocks<S>::kEvery == 0) live.update(through, stop);
+            if (live.none()) return;
             const int64_t end = std::min(count, first + kGroup);
             int listed = 0;
             for (int64_t entry = first; entry < end; ++entry) {
                 if (entry + kGroup < count) prefetch_record(bins.record(entries[entry + kGroup]), C);
                 const Record<S>& record = *reinterpret_cast<const Record<S>*>(bins.record(entries[entry]));
-                listed += list_blocks(at, record, tile_x - record.mean_x, tile_y - record.mean_y, blocks + listed);
+                uint8_t* own = blocks + listed;
+                listed += live.keep(own, list_blocks(at, record, tile_x - record.mean_x, tile_y - record.mean_y, own));
                 ends[entry - first] = listed;
             }
             int begin = 0;

@@ -72,19 +72,47 @@ struct TileSplat {
     }
 };
 
-// Whether no pixel of a tile has as much transmittance as `stop` left, or any at all.
+// The blocks of a tile in which some pixel still draws: of which the transmittance is neither 0 nor below `stop`.
 template <class S>
-bool opaque(const S (&through)[TileShape<S>::blocks][TileShape<S>::lanes], S stop) {
+class LiveBlocks {
     using P = Pack<S>;
-    P most(S(0));
-    for (const auto& block : through) {
-        const P t = P::load(block);
-        most = select(t > most, t, most);
+    using Shape = TileShape<S>;
+
+   public:
+    // Looked at after so many entries; a multiple of kGroup.
+    static constexpr int64_t kEvery = 64;
+
+    void set_all() {
+        std::memset(live_, 1, sizeof live_);
+        count_ = Shape::blocks;
     }
-    for (int i = 0; i < P::size; ++i)
-        if (most.v[i] >= stop && most.v[i] != S(0)) return false;
-    return true;
-}
+    void update(const S (&through)[Shape::blocks][Shape::lanes], S stop) {
+        count_ = 0;
+        for (int block = 0; block < Shape::blocks; ++block) {
+            const P t = P::load(through[block]);
+            const P left = select(t >= P(stop), t, P(S(0)));
+            S most = 0;
+            for (int lane = 0; lane < P::size; ++lane) most = left.v[lane] > most ? left.v[lane] : most;
+            live_[block] = most > S(0);
+            count_ += live_[block];
+        }
+    }
+    bool none() const { return count_ == 0; }
+    // Leaves out the numbers of the others; returns how many are left.
+    int keep(uint8_t* numbers, int count) const {
+        if (count_ == Shape::blocks) return count;
+        int kept = 0;
+        for (int i = 0; i < count; ++i) {
+            numbers[kept] = numbers[i];
+            kept += live_[numbers[i]];
+        }
+        return kept;
+    }
+
+   private:
+    uint8_t live_[Shape::blocks];
+    int count_;
+};
 
 // Entries whose blocks are listed ahead of the pair loop: the two overlap in the processor, and no branch of the one
 // waits for the other.
