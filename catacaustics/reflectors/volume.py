@@ -179,20 +179,26 @@ def _fill_convex(polygon: np.ndarray, width: int, height: int) -> np.ndarray:
     return (left - 1e-6 <= centers) & (centers <= right + 1e-6)
 
 
-def _hull_chains(mask: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
-    """Convex hull of a mask's pixel squares, (n, 2) corners with positive turn in (x, y), and its outline as chains of
-    corners: one closed chain, or, where it runs along the image's border, the open chains between."""
+def mask_hull(mask: Bool[np.ndarray, "height width"]) -> Float[np.ndarray, "n 2"]:
+    """Convex hull of a mask's pixel squares: corners with positive turn in (x, y)."""
     import cv2
 
-    height, width = mask.shape
+    width = mask.shape[1]
     rows = np.flatnonzero(mask.any(1))
     left, right = mask[rows].argmax(1), width - mask[rows, ::-1].argmax(1)
     corners = [np.stack([x, y], -1) for x in (left, right) for y in (rows, rows + 1)]
     hull = cv2.convexHull(np.concatenate(corners).astype(np.int32))[:, 0].astype(np.float64)
     following = np.roll(hull, -1, 0)
-    if (hull[:, 0] * following[:, 1] - hull[:, 1] * following[:, 0]).sum() < 0:
-        hull = hull[::-1]
-        following = np.roll(hull, -1, 0)
+    turn = (hull[:, 0] * following[:, 1] - hull[:, 1] * following[:, 0]).sum()
+    return hull if turn >= 0 else hull[::-1]
+
+
+def _hull_chains(mask: np.ndarray) -> tuple[np.ndarray, list[np.ndarray]]:
+    """A mask's hull, and its outline as chains of corners: one closed chain, or, where it runs along the image's
+    border, the open chains between."""
+    height, width = mask.shape
+    hull = mask_hull(mask)
+    following = np.roll(hull, -1, 0)
     border = ((hull == following) & ((hull == 0) | (hull == [width, height]))).any(1)
     if not border.any():
         return hull, [np.concatenate([hull, hull[:1]])]

@@ -24,6 +24,7 @@ from catacaustics.images import list_images, read_mask, write_image
 from catacaustics.reflectors.volume import (
     MaskError,
     ReflectionVolume,
+    mask_hull,
     volume_from_masks,
     volume_views,
     write_volume,
@@ -334,12 +335,7 @@ def _area(polygon: Float[np.ndarray, "n 2"]) -> float:
 def _fit(volume: ReflectionVolume, camera: Camera, mask: np.ndarray) -> float:
     """Share of a mask's hull that the volume still covers. The volume's picture lies inside the hull, but for the
     simplification of its outline and for masks on the image's border, which are open there."""
-    import cv2
-
-    hull = cv2.convexHull(np.argwhere(mask)[:, ::-1].astype(np.float32))[:, 0]
-    sides = np.ptp(hull, axis=0)
-    wanted = _area(hull) + sides.sum() + 1  # of the pixels' squares, not of their centres
-    return float(min(_area(_frame(volume.outline(camera), camera)) / wanted, 1.0))
+    return min(_area(_frame(volume.outline(camera), camera)) / _area(mask_hull(mask)), 1.0)
 
 
 # Masks from elsewhere ------------------------------------------------------------------------------------------------
