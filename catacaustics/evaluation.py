@@ -22,7 +22,14 @@ from catacaustics.report import ReportView, report_html, report_view
 from catacaustics.run import Run, open_run, read_log
 from catacaustics.scene import RenderOutput, Scene
 from catacaustics.shapes import Bool
+from catacaustics.training.corrections import align_view
+from catacaustics.training.initialize import scene_extent
 from catacaustics.training.photographs import scaled_camera
+
+_ALIGNED = (
+    "the view's own pose correction and three exposure gains, where training learned those of its photographs, fitted "
+    "to the held-out photograph with the scene frozen, then measured as the other rows"
+)
 
 
 def evaluate(config: EvaluateConfig) -> dict[str, Any]:
@@ -66,11 +73,13 @@ def evaluate_run(run: Run, shown_views: int = 12) -> dict[str, Any]:
 def format_table(result: dict[str, Any]) -> str:
     """The means of an evaluation as a plain-text table."""
     names = {"whole": "whole image", "inside": "inside the reflector"}
-    lines = [f"{'held-out views: ' + str(len(result['views'])):<22}{'PSNR':>9}{'SSIM':>9}{'FLIP':>9}"]
+    names |= {f"{key}_aligned": f"{name}, aligned" for key, name in names.items()}
+    width = max(len(name) for key, name in names.items() if result["mean"].get(key)) + 2
+    lines = [f"{'held-out views: ' + str(len(result['views'])):<{width}}{'PSNR':>9}{'SSIM':>9}{'FLIP':>9}"]
     for key, name in names.items():
-        m = result["mean"][key]
+        m = result["mean"].get(key)
         if m is not None:
-            lines.append(f"{name:<22}{m['psnr']:>6.2f} dB{m['ssim']:>9.4f}{m['flip']:>9.4f}")
+            lines.append(f"{name:<{width}}{m['psnr']:>6.2f} dB{m['ssim']:>9.4f}{m['flip']:>9.4f}")
     return "\n".join(lines)
 
 
@@ -132,6 +141,13 @@ def _measure(
         "height": camera.height,
         "seconds": seconds,
     }
+    learned = [bool(run.config.get(key)) for key in ("refine_poses", "exposure")]
+    if any(learned):
+        target = torch.from_numpy(photo).to(run.scene.device)
+        aligned = align_view(run.scene, camera, target, *learned, scene_extent(run.capture)).render(run.scene, camera)
+        again = compare(aligned.cpu().numpy(), photo, mask)
+        row["whole_aligned"] = again.whole.as_dict()
+        row["inside_aligned"] = again.inside.as_dict() if again.inside else None
     return row, report_view(row, photo, output, comparison.flip_map, mask) if shown else None
 
 
@@ -147,11 +163,12 @@ def _timed_render(scene: Scene, camera: Camera) -> tuple[RenderOutput, float]:
 
 
 def _means(rows: list[dict[str, Any]]) -> dict[str, Any]:
-    inside = [Metrics(**row["inside"]) for row in rows if row["inside"]]
-    return {
-        "whole": mean_metrics([Metrics(**row["whole"]) for row in rows]).as_dict(),
-        "inside": mean_metrics(inside).as_dict() if inside else None,
-    }
+    areas = [key for key in ("whole", "inside", "whole_aligned", "inside_aligned") if key in rows[0]]
+    means = {}
+    for area in areas:
+        values = [Metrics(**row[area]) for row in rows if row[area]]
+        means[area] = mean_metrics(values).as_dict() if values else None
+    return means
 
 
 def _protocol(run: Run, rows: list[dict[str, Any]]) -> dict[str, Any]:
@@ -166,6 +183,7 @@ def _protocol(run: Run, rows: list[dict[str, Any]]) -> dict[str, Any]:
         "masks": {key: sources[key] for key in sorted(sources)},
         "views_inside": sum(row["inside"] is not None for row in rows),
         "metrics": PROTOCOL
+        | ({"aligned": _ALIGNED} if "whole_aligned" in rows[0] else {})
         | {"lpips": f"not measured: {missing}" if missing else "VGG-16, whole image (torchmetrics)"},
         "seconds_per_frame": float(np.median([row["seconds"] for row in rows])),
         "device": torch.cuda.get_device_name(device) if device.type == "cuda" else _cpu_name(),

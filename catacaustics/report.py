@@ -27,7 +27,12 @@ _METRICS = {
     "flip": ("FLIP", "", "lower is better", 4),
     "lpips": ("LPIPS", "", "lower is better", 4),
 }
-_AREAS = {"whole": "whole image", "inside": "inside the reflector"}
+_AREAS = {
+    "whole": "whole image",
+    "inside": "inside the reflector",
+    "whole_aligned": "whole image, view aligned",
+    "inside_aligned": "inside the reflector, view aligned",
+}
 
 
 @dataclass(frozen=True)
@@ -172,6 +177,7 @@ def _summary(mean: dict[str, Any]) -> str:
     rows = "".join(
         f'<tr><th scope="row">{label}</th>' + "".join(f"<td>{_number(mean[area], k)}</td>" for k in keys) + "</tr>"
         for area, label in _AREAS.items()
+        if area in mean
     )
     return f'<table class="summary"><thead><tr><td></td>{heads}</tr></thead><tbody>{rows}</tbody></table>'
 
@@ -197,7 +203,7 @@ def _view(view: ReportView) -> str:
         f"<span>{label} <b>{_number(row[area], 'psnr')}</b> dB, SSIM <b>{_number(row[area], 'ssim')}</b>, "
         f"FLIP <b>{_number(row[area], 'flip')}</b></span>"
         for area, label in _AREAS.items()
-        if row[area] is not None
+        if row.get(area) is not None
     )
     return (
         f'<article><h3>{escape(row["name"])}</h3><p class="measured">{measured}</p>'
@@ -305,7 +311,8 @@ def _thin(points: list[tuple[float, float]], most: int = 300) -> tuple[np.ndarra
 
 def _view_table(rows: list[dict[str, Any]]) -> str:
     keys = [key for key in _METRICS if key in rows[0]["whole"]]
-    columns = [(area, key) for area in _AREAS for key in keys if not (area == "inside" and key == "lpips")]
+    areas = [area for area in _AREAS if area in rows[0]]
+    columns = [(area, key) for area in areas for key in keys if not (area.startswith("inside") and key == "lpips")]
     heads = "".join(f'<th scope="col">{_METRICS[k][0]}<small>{_AREAS[a]}</small></th>' for a, k in columns)
     body = "".join(
         f'<tr><th scope="row">{escape(row["name"])}</th>'

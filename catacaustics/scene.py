@@ -60,6 +60,16 @@ class PointParameters(nn.Module):
         return len(self.positions)
 
 
+class Motion(NamedTuple):
+    """A rigid motion of the world before a camera, about the camera's centre c: x -> c + rotation (x - c) + shift."""
+
+    rotation: Float[Tensor, "3 3"]
+    shift: Float[Tensor, "3"]
+
+    def apply(self, points: Float[Tensor, "n 3"], center: Float[Tensor, "3"]) -> Float[Tensor, "n 3"]:
+        return center + (points - center) @ self.rotation.T + self.shift
+
+
 class Layers(NamedTuple):
     """What the splatter made for one view: feature images, rho, transmittances, depth, and the primary splats."""
 
@@ -121,17 +131,26 @@ class Scene(nn.Module):
     def device(self) -> torch.device:
         return self.primary.positions.device
 
-    def layers(self, camera: Camera, viewport: Viewport | None = None, warp_camera: Camera | None = None) -> Layers:
-        """Splat all clouds; differentiable. `warp_camera` decouples what is reflected from where it is seen from."""
+    def layers(
+        self,
+        camera: Camera,
+        viewport: Viewport | None = None,
+        warp_camera: Camera | None = None,
+        motion: Motion | None = None,
+    ) -> Layers:
+        """Splat all clouds; differentiable. `warp_camera` decouples what is reflected from where it is seen from;
+        `motion` corrects the camera's pose, with gradients."""
         viewport = viewport or camera.viewport
         directions = self._directions(camera, viewport)
-        splats = self._splat_primary(camera, viewport)
+        if motion is not None:
+            directions = directions @ motion.rotation
+        splats = self._splat_primary(camera, viewport, motion)
         image, through = splats.image, splats.transmittance
         rho = image[..., FEATURES]
         primary = image[..., :FEATURES]
         if self.environment is not None:
             primary = primary + through[..., None] * self.environment(directions)
-        reflection, reflection_through = self._splat_reflections(camera, viewport, warp_camera or camera)
+        reflection, reflection_through = self._splat_reflections(camera, viewport, warp_camera or camera, motion)
         alpha = 1 - through
         depth = image[..., FEATURES + 1] / torch.where(alpha > 1e-4, alpha, torch.inf)
         return Layers(primary, reflection, rho, reflection_through, through, depth, directions, splats)
@@ -166,12 +185,15 @@ class Scene(nn.Module):
         rays = torch.from_numpy(camera.ray_directions(pixel_centers(viewport))).to(self.primary.positions)
         return torch.nn.functional.normalize(rays, dim=-1)
 
-    def _splat_primary(self, camera: Camera, viewport: Viewport) -> SplatOutput:
+    def _splat_primary(self, camera: Camera, viewport: Viewport, motion: Motion | None) -> SplatOutput:
         cloud = self.primary
         with torch.no_grad():
             footprints = cloud.log_footprints.exp()
         near = points_in_view(cloud.positions.detach(), footprints, camera, viewport, self.splatting)
         positions, normals, log_footprints, logits, features = _rows(cloud, near)
+        if motion is not None:
+            positions = motion.apply(positions, self._center(camera))
+            normals = normals @ motion.rotation.T
         forward = torch.tensor(camera.camera_from_world[2], dtype=positions.dtype, device=self.device)
         depth = positions.detach() @ forward[:3] + forward[3]
         assert cloud.rho_logits is not None
@@ -188,14 +210,20 @@ class Scene(nn.Module):
         )
         return output._replace(visible=near[output.visible])
 
-    def _splat_reflections(self, camera: Camera, viewport: Viewport, warp_camera: Camera) -> tuple[Tensor, Tensor]:
+    def _center(self, camera: Camera) -> Tensor:
+        return torch.tensor(camera.center, dtype=self.primary.positions.dtype, device=self.device)
+
+    def _splat_reflections(
+        self, camera: Camera, viewport: Viewport, warp_camera: Camera, motion: Motion | None
+    ) -> tuple[Tensor, Tensor]:
         """All reflection clouds over each other, nearer reflectors first. Sources are round; where the warp does not
         shape their images, disks face the camera."""
         like = self.primary.positions
         image = like.new_zeros(viewport.height, viewport.width, FEATURES)
         through = like.new_ones(viewport.height, viewport.width)
-        center = torch.tensor(camera.center, dtype=like.dtype, device=like.device)
-        warp_center = torch.tensor(warp_camera.center, dtype=like.dtype, device=like.device)
+        center, warp_center = self._center(camera), self._center(warp_camera)
+        if motion is not None:
+            warp_center = warp_center - motion.shift @ motion.rotation  # where the corrected camera stands
         distances = [float(np.linalg.norm(v.center - camera.center)) for v in self.volumes]
         for i in np.argsort(distances, kind="stable"):
             cloud, warp = self.reflections[i], self.warps[i]
@@ -207,12 +235,15 @@ class Scene(nn.Module):
                     near = near[shown.visible[near]]
             # Only points that can land in the viewport are warped with gradients.
             positions, _, log_footprints, logits, features = _rows(cloud, near)
-            shown = warp(positions, warp_center)
-            normals = shown.normals
+            shown = warp(positions, warp_center, None if shown.start is None else shown.start[near])
+            displayed, normals = shown.positions, shown.normals
+            if motion is not None:
+                displayed = motion.apply(displayed, center)
+                normals = None if normals is None else normals @ motion.rotation.detach().T
             if normals is None:
-                normals = torch.nn.functional.normalize(center - shown.positions.detach(), dim=1)
+                normals = torch.nn.functional.normalize(center - displayed.detach(), dim=1)
             output = splat_points(
-                shown.positions,
+                displayed,
                 normals,
                 _stretched(log_footprints.exp(), shown),
                 torch.sigmoid(logits),

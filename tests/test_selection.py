@@ -50,7 +50,7 @@ def chosen(tmp_path_factory):
 def test_every_rung_is_tried_and_the_choice_is_kept_with_its_reasons(chosen):
     config, choice = chosen
     assert [t["name"] for t in choice["trials"] if t["question"] == "model"] == list(LADDER)
-    assert set(choice["taken"]) == {"model", "environment", "reflection points", "primary points"} - (
+    assert set(choice["taken"]) == {"model", "environment", "reflection points", "primary points", "photographs"} - (
         {"reflection points"} if choice["chosen"]["model"] == ["none"] else set()
     )
     settings = json.loads((config.run / "config.json").read_text())

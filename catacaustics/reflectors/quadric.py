@@ -30,11 +30,13 @@ _STRETCH = 30.0
 class Specular(NamedTuple):
     """Points of reflection: differentiable `points`; `visible` where camera and source face the mirror there and the
     path is stationary; `jacobian` (no gradients), the map from displacements of the source to displacements of the
-    displayed point, which lies on the ray at the length of the path."""
+    displayed point, which lies on the ray at the length of the path; `start`, the solution on the unit sphere, which
+    saves solving again for the same arguments."""
 
     points: Float[Tensor, "n 3"]
     visible: Bool[Tensor, "n"]
     jacobian: Float[Tensor, "n 3 3"]
+    start: Float[Tensor, "n 3"]
 
 
 def sphere_angle(
@@ -105,6 +107,7 @@ def specular_points(
     center: Float[Tensor, "3"],
     axes: Float[Tensor, "3 3"],
     concave: bool = False,
+    start: Float[Tensor, "n 3"] | None = None,
 ) -> Specular:
     """Points of reflection on an ellipsoid, with exact first derivatives by all arguments.
 
@@ -116,9 +119,10 @@ def specular_points(
         camera: camera centre.
         center, axes: x = center + axes @ u for unit u; the columns are the half-axes.
         concave: the inner side mirrors.
+        start: what an earlier call returned for the same arguments.
     """
     with torch.no_grad():
-        u = _solve(sources, camera, center, axes, concave)
+        u = _solve(sources, camera, center, axes, concave) if start is None else start
         basis = _tangents(u)
         path = _path(u, sources, camera, center, axes)
         hessian = _hessian(path, u, basis, axes)
@@ -133,7 +137,7 @@ def specular_points(
         tangential = tangential - (tangential * normal).sum(1, keepdim=True) * normal
         visible = (cosine > _GRAZING) & (tangential.norm(dim=1) < 1e-2)
         jacobian = _display_jacobian(path, hessian, basis, axes)
-    return Specular(points, visible, jacobian)
+    return Specular(points, visible, jacobian, u)
 
 
 class _Path(NamedTuple):

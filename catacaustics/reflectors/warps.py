@@ -1,6 +1,7 @@
 """Warps: where a reflection point is displayed for a camera centre. A ladder, from no motion to optics to a network.
 
-Every warp is a module with forward(points (n, 3), center (3,)) -> Displayed. What the points are depends on the rung:
+Every warp is a module with forward(points (n, 3), center (3,), start) -> Displayed; `start` is what an earlier call
+returned for the same points and centre, and saves work. What the points are depends on the rung:
 of `plane` and the quadrics they are the world positions of what is mirrored, of the others positions where it is seen.
 """
 
@@ -13,21 +14,24 @@ from torch import Tensor, nn
 from catacaustics.reflectors.quadric import specular_points, tilted_disks
 from catacaustics.shapes import Bool, Float
 
+Points = Float[Tensor, "n 3"]
+
 
 class Displayed(NamedTuple):
     """Where points appear. `normals` None: disks face the camera; `stretch` multiplies squared radii (the footprint's
-    Jacobian, no gradients); points that are not `visible` are not drawn."""
+    Jacobian, no gradients); points that are not `visible` are not drawn; `start` can be handed to the next call."""
 
     positions: Float[Tensor, "n 3"]
     normals: Float[Tensor, "n 3"] | None = None
     stretch: Float[Tensor, "n"] | None = None
     visible: Bool[Tensor, "n"] | None = None
+    start: Float[Tensor, "n 3"] | None = None
 
 
 class StaticWarp(nn.Module):
     """p' = p: painted-on highlights, and flat mirrors, whose image does not move with the camera."""
 
-    def forward(self, points: Float[Tensor, "n 3"], center: Float[Tensor, "3"]) -> Displayed:
+    def forward(self, points: Points, center: Float[Tensor, "3"], start: Points | None = None) -> Displayed:
         return Displayed(points)
 
 
@@ -52,7 +56,7 @@ class PlaneWarp(nn.Module):
         normal = torch.nn.functional.normalize(self.start_normal + self.tilt, dim=0)
         return normal, normal @ self.start_point + self.offset * self.scale
 
-    def forward(self, points: Float[Tensor, "n 3"], center: Float[Tensor, "3"]) -> Displayed:
+    def forward(self, points: Points, center: Float[Tensor, "3"], start: Points | None = None) -> Displayed:
         normal, distance = self.plane()
         height = points @ normal - distance
         visible = (height > 0) & (center @ normal > distance)
@@ -91,15 +95,15 @@ class QuadricWarp(nn.Module):
             axes = torch.linalg.matrix_exp(cross) @ axes
         return center, axes
 
-    def forward(self, points: Float[Tensor, "n 3"], center: Float[Tensor, "3"]) -> Displayed:
+    def forward(self, points: Points, center: Float[Tensor, "3"], start: Points | None = None) -> Displayed:
         middle, axes = self.shape()
-        found = specular_points(points, center, middle, axes, bool(self.concave))
+        found = specular_points(points, center, middle, axes, bool(self.concave), start)
         ray = found.points - center
         near = ray.norm(dim=1, keepdim=True).clamp_min(1e-12)
         direction = ray / near
         length = near + (points - found.points).norm(dim=1, keepdim=True)
         normals, stretch = tilted_disks(found.jacobian, -direction.detach())
-        return Displayed(center + length * direction, normals, stretch, found.visible)
+        return Displayed(center + length * direction, normals, stretch, found.visible, found.start)
 
 
 class NeuralWarp(nn.Module):
@@ -119,7 +123,7 @@ class NeuralWarp(nn.Module):
         hidden = [m for a, b in itertools.pairwise(sizes) for m in (nn.Linear(a, b), nn.ReLU())]
         self.network = nn.Sequential(*hidden, nn.Linear(width, 3))
 
-    def forward(self, points: Float[Tensor, "n 3"], center: Float[Tensor, "3"]) -> Displayed:
+    def forward(self, points: Points, center: Float[Tensor, "3"], start: Points | None = None) -> Displayed:
         p = (points - self.middle) / self.half_size
         c = ((center - self.middle) / self.half_size).expand_as(p)
         # Scaled so that training starts with almost no motion.
@@ -134,8 +138,8 @@ class QuadricNeuralWarp(nn.Module):
         self.quadric = quadric
         self.neural = neural
 
-    def forward(self, points: Float[Tensor, "n 3"], center: Float[Tensor, "3"]) -> Displayed:
-        image = self.quadric(points, center)
+    def forward(self, points: Points, center: Float[Tensor, "3"], start: Points | None = None) -> Displayed:
+        image = self.quadric(points, center, start)
         return image._replace(positions=self.neural(image.positions, center).positions)
 
 

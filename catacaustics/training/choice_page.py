@@ -12,6 +12,7 @@ _TITLES = {
     "environment": ("Does the scene need an environment map?", "PSNR of the whole image"),
     "reflection points": ("How many reflection points?", "PSNR inside the reflectors"),
     "primary points": ("How many primary points?", "PSNR of the whole image"),
+    "photographs": ("Do poses or exposures need corrections?", "PSNR of the whole image, aligned"),
 }
 
 
@@ -28,7 +29,9 @@ def choice_html(folder: Path, result: dict[str, Any], least_gain: float) -> str:
     chosen, reflectors, trials = result["chosen"], result["reflectors"], result["trials"]
     models = ", ".join(f"<b>{escape(r)}</b>: {escape(m)}" for r, m in zip(reflectors, chosen["model"], strict=True))
     rest = ", ".join(
-        f"{k.replace('_', ' ')} {v:,}" if v else f"no {k.replace('_width', '')} map"
+        f"{k.replace('_', ' ')}: {'yes' if v else 'no'}"
+        if isinstance(v, bool)
+        else (f"{v:,} {k.replace('_', ' ')}" if v else "no environment map")
         for k, v in chosen.items()
         if k != "model"
     )

@@ -15,9 +15,11 @@ from tqdm import tqdm
 from catacaustics.capture.dataset import Capture
 from catacaustics.config import TrainConfig
 from catacaustics.errors import UserError
+from catacaustics.files import write_json
 from catacaustics.losses import coverage_loss, dssim, total_variation, weight_loss
 from catacaustics.reflectors.volume import ReflectionVolume
 from catacaustics.scene import Layers, Scene
+from catacaustics.training.corrections import Corrections
 from catacaustics.training.densification import GradientStatistics, densify
 from catacaustics.training.initialize import (
     Reflector,
@@ -59,6 +61,7 @@ class TrainState:
     """Everything that a checkpoint keeps."""
 
     scene: Scene
+    corrections: Corrections
     optimizer: RowAdam
     rng: np.random.Generator
     statistics: GradientStatistics
@@ -95,6 +98,8 @@ def fit(capture: Capture, reflectors: list[Reflector], config: TrainConfig, prob
         print(f"training: interrupted at step {state.step}, checkpoint saved; go on with --resume")
         raise
     save_checkpoint(run, state)
+    if list(state.corrections.parameters()):
+        write_json(run / "corrections.json", state.corrections.summary([v.name for v in capture.train]))
     state.scene.save(run / "scene.safetensors")
     return state.scene
 
@@ -116,9 +121,12 @@ def _start(
         scene = initial_scene(capture, reflectors, seeds, STAGES[0].points, config).to(device_of(config))
         (Path(config.run) / "metrics.jsonl").unlink(missing_ok=True)
         statistics = GradientStatistics(len(scene.primary), scene.device)
-        return TrainState(scene, make_optimizer(scene, config), rng, statistics)
+        corrections = _corrections(capture, config)
+        return TrainState(scene, corrections, make_optimizer(scene, config, corrections), rng, statistics)
     scene, tensors, notes = Scene.load_with_extras(path, device_of(config))
-    optimizer = make_optimizer(scene, config)
+    corrections = _corrections(capture, config)
+    corrections.load_state_dict({k: tensors[f"corrections.{k}"] for k in corrections.state_dict()})
+    optimizer = make_optimizer(scene, config, corrections)
     restore_optimizer(optimizer, tensors)
     statistics = GradientStatistics(len(scene.primary), scene.device)
     for name in vars(statistics):
@@ -127,7 +135,12 @@ def _start(
     _trim_log(Path(config.run), notes["step"])
     print(f"training: going on from step {notes['step']}")
     place = (notes[key] for key in ("step", "seconds", "stage", "queue", "gradient_norm", "densified"))
-    return TrainState(scene, optimizer, rng, statistics, *place)
+    return TrainState(scene, corrections, optimizer, rng, statistics, *place)
+
+
+def _corrections(capture: Capture, config: TrainConfig) -> Corrections:
+    poses, exposure = bool(config.refine_poses), bool(config.exposure)
+    return Corrections(len(capture.train), poses, exposure, scene_extent(capture)).to(device_of(config))
 
 
 def save_checkpoint(run: Path, state: TrainState) -> None:
@@ -142,6 +155,7 @@ def save_checkpoint(run: Path, state: TrainState) -> None:
         "rng": state.rng.bit_generator.state,
     }
     extra = {f"statistics.{name}": value for name, value in vars(state.statistics).items()}
+    extra |= {f"corrections.{name}": value for name, value in state.corrections.state_dict().items()}
     state.scene.save(run / "checkpoint.safetensors", extra | optimizer_tensors(state.optimizer), notes)
 
 
@@ -223,7 +237,7 @@ def _enter_stage(state: TrainState, progress: float, seeds: list[Seeds], config:
     scene.primary = grow_cloud(scene.primary, seeds[0], stage_count(seeds[0], share))
     for i, cloud_seeds in enumerate(seeds[1:]):
         scene.reflections[i] = grow_cloud(scene.reflections[i], cloud_seeds, stage_count(cloud_seeds, share))
-    state.optimizer = make_optimizer(scene, config)
+    state.optimizer = make_optimizer(scene, config, state.corrections)
     state.statistics = GradientStatistics(len(scene.primary), scene.device)
     state.stage = index
 
@@ -243,18 +257,20 @@ def _step(
     for _ in range(config.accumulate):
         if not state.queue:
             state.queue = state.rng.permutation(len(capture.train)).tolist()
-        view = capture.train[state.queue.pop()]
+        index = state.queue.pop()
+        view = capture.train[index]
         camera = scaled_camera(view.camera, config.image_size, stage.scale)
         viewport = choose_patch(camera, volumes, config.patch, config.reflector_share, state.rng)
         image = photographs.get(view, camera.width, camera.height)
         x0, y0, width, height = viewport
         patch = np.ascontiguousarray(image[y0 : y0 + height, x0 : x0 + width])
         target = torch.from_numpy(patch).to(scene.device).float() / 255
-        layers = scene.layers(camera, viewport)
+        layers = scene.layers(camera, viewport, motion=state.corrections.motion(index))
         if layers.splats.screen.requires_grad:
             layers.splats.screen.retain_grad()
         masks = [torch.from_numpy(v.project_mask(camera, viewport)).to(scene.device) for v in scene.volumes]
-        losses, psnr = _losses(scene, layers, target, masks, config)
+        rgb = state.corrections.expose(index, scene.decode(layers))
+        losses, psnr = _losses(rgb, layers, target, masks, config)
         total = torch.stack(list(losses.values())).sum() / config.accumulate
         _check_finite(scene, total, state.step, "loss")
         total.backward()
@@ -288,9 +304,8 @@ def _clip_gradients(state: TrainState) -> float:
 
 
 def _losses(
-    scene: Scene, layers: Layers, target: Tensor, masks: list[Tensor], config: TrainConfig
+    rgb: Tensor, layers: Layers, target: Tensor, masks: list[Tensor], config: TrainConfig
 ) -> tuple[dict[str, Tensor], float]:
-    rgb = scene.decode(layers)
     losses = {
         "l1": config.weight_l1 * (rgb - target).abs().mean(),
         "dssim": config.weight_dssim * dssim(rgb, target),

@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from catacaustics.config import TrainConfig
 from catacaustics.scene import Scene
+from catacaustics.training.corrections import Corrections
 
 
 def _rate(name: str, config: TrainConfig, extent: float, progress: float, warm_up: bool) -> float:
@@ -21,6 +22,9 @@ def _rate(name: str, config: TrainConfig, extent: float, progress: float, warm_u
         return start * math.exp(progress * math.log(end / start))
 
     kind = name.split(".")[-1]
+    if name.startswith("corrections."):
+        start = config.lr_pose if kind == "poses" else config.lr_exposure
+        return 0.0 if warm_up else decay(start, start / 10)
     if name.startswith("renderer.") or ".network." in name:
         return decay(config.lr_network, config.lr_network_final)
     if name.startswith("warps."):
@@ -97,18 +101,21 @@ def _adam(
     value.sub_(rate * mean / (square.sqrt() + group["eps"]))
 
 
-def make_optimizer(scene: Scene, config: TrainConfig) -> RowAdam:
+def make_optimizer(scene: Scene, config: TrainConfig, corrections: Corrections | None = None) -> RowAdam:
     """One group a parameter, named. Weight decay acts on the warps only (paper section 5.2)."""
+    named = [*scene.named_parameters()]
+    if corrections is not None:
+        named += [(f"corrections.{name}", parameter) for name, parameter in corrections.named_parameters()]
     groups = [
         {
             "params": [parameter],
             "name": name,
             "lr": 0.0,
             "weight_decay": config.warp_weight_decay if ".network." in name else 0.0,
-            "rows": name.startswith(("primary.", "reflections.")),
+            "rows": name.startswith(("primary.", "reflections.", "corrections.")),
             "row_rates": _source_distances(scene, name),
         }
-        for name, parameter in scene.named_parameters()
+        for name, parameter in named
         if parameter.requires_grad
     ]
     # Losses are weighted by 0.05 and spread over thousands of points: gradients are far below Adam's default eps.

@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from catacaustics.capture.dataset import Capture, View
 from catacaustics.config import TrainConfig
@@ -21,7 +22,8 @@ from catacaustics.metrics import psnr
 from catacaustics.reflectors.volume import ReflectionVolume
 from catacaustics.scene import Scene
 from catacaustics.training.choice_page import choice_html
-from catacaustics.training.initialize import named_reflectors, usual_points
+from catacaustics.training.corrections import align_view
+from catacaustics.training.initialize import named_reflectors, scene_extent, usual_points
 from catacaustics.training.loop import fit
 from catacaustics.training.photographs import scaled_camera
 
@@ -40,6 +42,8 @@ _SIZE = 240
 _PATCH = 120
 _FACTORS = (0.5, 1.0, 2.0)
 """Sizes of a cloud that are tried, in units of `usual_points`."""
+_PATIENT = 15
+"""Minutes of training from which on corrections of the photographs are tried."""
 _VIEWS = 8
 """Validation views at most."""
 
@@ -122,9 +126,29 @@ def choose_models(capture: Capture, volumes: list[ReflectionVolume], config: Tra
         index = best([_joined(t) if field == "reflection_points" else t.whole for t in done])
         taken[question] = [done[index].name]
         chosen[field] = int(_FACTORS[index] * usual_points(capture, volumes, config)[field])
+    chosen |= _photographs(trials, config, chosen, taken)
     trials.finish(chosen, taken, [v.name for v in volumes])
     minutes = None if config.minutes is None else max(config.minutes - trials.seconds / 60, 0.25 * config.minutes)
     return replace(config, minutes=minutes, **chosen)
+
+
+def _photographs(trials: "_Trials", config: TrainConfig, chosen: dict, taken: dict[str, list[str]]) -> dict:
+    """Do poses or exposures need corrections? Scored on views aligned in both, so that neither has an advantage. Short
+    trainings do without: what is not asked stays off."""
+    free = [key for key in ("refine_poses", "exposure") if getattr(config, key) is None]
+    if not free or (config.minutes is not None and config.minutes < _PATIENT):
+        return {}
+    names = {"refine_poses": "camera poses", "exposure": "exposure"}
+    options: list[dict] = [{key: False for key in free}]
+    options += [{key: key == one for key in free} for one in free]
+    options += [{key: True for key in free}] if len(free) > 1 else []
+    done = [
+        trials.run(" and ".join(names[k] for k in free if o[k]) or "as they are", "photographs", chosen | o)
+        for o in options
+    ]
+    index = best([t.whole for t in done])
+    taken["photographs"] = [done[index].name]
+    return options[index]
 
 
 def _filled(reflectors: list, rung: str) -> tuple[str, ...]:
@@ -146,7 +170,7 @@ class _Trials:
         self.capture = replace(capture, train=[v for v in views if v not in self.validation], held_out=[])
         self.volumes = volumes
         self.run_folder = Path(config.run)
-        trials = len(LADDER) + 6
+        trials = len(LADDER) + (6 if config.minutes is None or config.minutes < _PATIENT else 10)
         size = min(_SIZE, config.image_size)
         named = {k: getattr(config, k) for k in ("primary_points", "reflection_points")}
         self.config = replace(
@@ -172,7 +196,7 @@ class _Trials:
         found = [t for t in self.done if t.name == name and t.question == question]
         if found:
             return found[0]
-        same = [t for t in self.done if dict(t.settings) == _plain(settings)]
+        same = [t for t in self.done if dict(t.settings) == _plain(settings) and question != "photographs"]
         trial = replace(same[0], name=name, question=question) if same else None
         if trial is None:
             folder = self.run_folder / "trials" / name.replace(" ", "_")
@@ -214,7 +238,12 @@ class _Trials:
         whole = []
         for view in self.validation:
             camera = scaled_camera(view.camera, self.config.image_size, 1.0)
-            image, photo = scene.render(camera).rgb.cpu().numpy(), self._photograph(view, camera.width, camera.height)
+            photo = self._photograph(view, camera.width, camera.height)
+            if question == "photographs":
+                target, extent = torch.from_numpy(photo).to(scene.device), scene_extent(self.capture)
+                image = align_view(scene, camera, target, True, True, extent).render(scene, camera).cpu().numpy()
+            else:
+                image = scene.render(camera).rgb.cpu().numpy()
             whole.append(psnr(image, photo))
             for scores, volume in zip(inside, self.volumes, strict=True):
                 mask = volume.project_mask(camera)
