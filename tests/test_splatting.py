@@ -249,9 +249,17 @@ def test_early_stop_draws_nothing_behind_and_gradients_belong_to_that_image():
 
 def test_the_presets_differ_in_the_cut_offs_alone():
     assert SplatConfig.exact() == SplatConfig()
-    assert SplatConfig.fast(near=0.5) == SplatConfig(near=0.5, alpha_min=1 / 255, stop_transmittance=1e-4)
+    assert SplatConfig.fast(near=0.5) == SplatConfig(near=0.5, stop_transmittance=1e-4)
     with pytest.raises(TypeError, match="alpha_mni"):
         SplatConfig.fast(alpha_mni=0.1)
+
+
+def test_the_fast_preset_changes_the_image_by_no_more_than_the_light_it_stops():
+    scene = random_scene(600, size=0.2)
+    exact = splat_points(*scene, front_camera(), config=SplatConfig.exact())
+    fast = splat_points(*scene, front_camera(), config=SplatConfig.fast())
+    error = (exact.image - fast.image).abs().max()
+    assert 0 < error <= 1e-4 * float(scene[4].max())
 
 
 def test_cut_off_at_small_alpha_changes_the_image_by_no_more_than_what_it_drops():

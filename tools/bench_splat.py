@@ -57,6 +57,15 @@ def random_splats(count: int, width: int, height: int, channels: int, device: st
     return Disks(*(t.to(device).requires_grad_() for t in scene)), camera
 
 
+def opaque_splats(count: int, width: int, height: int, channels: int) -> tuple[Disks, Camera]:
+    """The same, three times as wide and of opacity 0.8 to 0.99: most are hidden, as in the cloud of a real room."""
+    scene, camera = random_splats(count, width, height, channels)
+    with torch.no_grad():
+        scene.footprints.mul_(9)
+        scene.opacities.mul_(0.2).add_(0.8)
+    return scene, camera
+
+
 def count_pairs(scene: Disks, camera: Camera, config: SplatConfig) -> int:
     """Splat-pixel pairs: the area of the ellipses in pixels."""
     with torch.no_grad():
@@ -138,19 +147,19 @@ def gradients(scene: Disks, camera: Camera, config: SplatConfig) -> dict[str, Te
 
 def cut_offs(options: argparse.Namespace) -> list[dict]:
     """Errors of the image in its units (features lie in [0, 1]); of gradients as a share of the exact ones' norm."""
-    fast = SplatConfig.fast()
     configs = {
         "exact": SplatConfig.exact(),
-        "alpha_min 1/255": SplatConfig(alpha_min=fast.alpha_min),
-        "stop 1e-4": SplatConfig(stop_transmittance=1e-4),
+        "fast": SplatConfig.fast(),  # stop_transmittance 1e-4
         "stop 1e-3": SplatConfig(stop_transmittance=1e-3),
         "stop 1e-2": SplatConfig(stop_transmittance=1e-2),
-        "fast": fast,
+        "alpha_min 1/1000": SplatConfig(alpha_min=1e-3),
+        "alpha_min 1/255": SplatConfig(alpha_min=1 / 255),
+        "1/255 and 1e-4": SplatConfig.fast(alpha_min=1 / 255),
     }
     results = []
-    for size in options.sizes:
-        count, width, height = SIZES[size]
-        scene, camera = random_splats(count, width, height, options.channels)
+    for size in [*options.sizes, "opaque"]:
+        make = opaque_splats if size == "opaque" else random_splats
+        scene, camera = make(*SIZES.get(size, (300_000, 1000, 666)), options.channels)
         rows: dict[str, list] = {name: [] for name in configs}
         for _ in range(options.runs + 1):
             for name, config in configs.items():
@@ -163,7 +172,7 @@ def cut_offs(options: argparse.Namespace) -> list[dict]:
             gradient = max(float((got[k] - exact[k]).norm() / exact[k].norm()) for k in NAMES)
             saved = 1 - (forward + backward) / whole
             print(
-                f"{size:>5} {name:<16} forward {1000 * forward:7.1f} ms  backward {1000 * backward:7.1f} ms"
+                f"{size:>6} {name:<16} forward {1000 * forward:7.1f} ms  backward {1000 * backward:7.1f} ms"
                 f"  saved {100 * saved:5.1f} %  image error max {error.max():.1e} mean {error.mean():.1e}"
                 f"  gradient error {gradient:.1e}"
             )
