@@ -111,6 +111,18 @@ def test_the_proposed_views_see_the_target_in_the_middle_and_bound_a_ball_better
     assert overlap(proposed) > max(0.87, np.quantile(others, 0.9))
 
 
+def test_views_that_are_painted_already_stay_proposed():
+    cameras = [v.camera for v in open_capture(BALL).train]
+    target = look_at_point(cameras)
+    first = propose_views(cameras, target)
+    assert propose_views(cameras, np.array([0.0, 0, 0.966]), painted=first) == first
+    for painted in ([5], [1, 2, 3]):
+        proposed = propose_views(cameras, target, painted=painted)
+        assert len(set(proposed)) == 4
+        assert set(painted) < set(proposed)
+    assert set(propose_views(cameras, target, painted=range(20))) < set(range(20))
+
+
 def zigzag(mask: np.ndarray, size: float) -> np.ndarray:
     """What a hurried hand paints over a round object."""
     import cv2

@@ -9,6 +9,7 @@ import sys
 import threading
 import webbrowser
 from collections.abc import Callable
+from contextlib import suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -232,14 +233,12 @@ def _state(store: MaskStore) -> dict[str, Any]:
     """What the page needs at the start."""
     capture = store.capture
     train = [view.camera for view in capture.train]
-    target = look_at_point(train)
-    for name in store.reflectors():
-        try:
+    target, painted = look_at_point(train), []
+    for name in list(store.reflectors())[:1]:
+        painted = [i for i in store.masked_views(name) if i < len(train)]
+        with suppress(UserError):
             target = store.volume(name)[0].center
-            break
-        except UserError:
-            continue
-    proposed = set(propose_views(train, target))
+    proposed = set(propose_views(train, target, painted=painted))
     centers = np.array([view.camera.center for view in store.views])
     reach = float(np.median(np.linalg.norm(centers - target, axis=-1)))
     views = []

@@ -47,9 +47,11 @@ export class Filmstrip {
     canvas.height = Math.round(HEIGHT * ratio);
     const caption = document.createElement('span');
     caption.className = 'caption';
+    caption.style.width = canvas.style.width;
     const label = document.createElement('span');
     label.className = 'name';
-    label.textContent = name.replace(/\.[^.]*$/, '');
+    label.append(document.createElement('bdi'));
+    label.firstChild.textContent = name.replace(/\.[^.]*$/, '');
     const badge = document.createElement('span');
     badge.className = 'badge';
     caption.append(label, badge);

@@ -180,12 +180,15 @@ export class Painting extends EventTarget {
     if (this.saving) return;
     this.saving = true;
     this.emit('status');
-    while (this.again) {
-      this.again = false;
-      await this.saveAll();
+    try {
+      while (this.again) {
+        this.again = false;
+        await this.saveAll();
+      }
+    } finally {
+      this.saving = false;
+      this.emit('status');
     }
-    this.saving = false;
-    this.emit('status');
     if (this.problem) this.retry = setTimeout(() => this.flush(), RETRY);
   }
 
