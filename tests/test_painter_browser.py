@@ -81,7 +81,7 @@ class Painter:
     def __init__(self, context, address: str):
         self.requests, self.errors = [], []
         self.page = context.new_page()
-        self.page.set_default_timeout(10_000)
+        self.page.set_default_timeout(20_000)
         self.page.on("request", lambda request: self.requests.append(request.url))
         self.page.on("pageerror", lambda error: self.errors.append(str(error)))
         self.open(address)
@@ -121,7 +121,7 @@ class Painter:
         self.page.locator("#status[data-state=saved]").wait_for()
 
     def wait_for(self, expression: str) -> None:
-        deadline = time.monotonic() + 10
+        deadline = time.monotonic() + 20
         while not self.ask(expression):
             assert time.monotonic() < deadline, expression
             self.page.wait_for_timeout(20)
