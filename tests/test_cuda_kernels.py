@@ -45,7 +45,7 @@ def test_every_kernel_compiles_for_every_generation_of_gpus_and_keeps_its_sums_i
     known = subprocess.run([NVCC, "--list-gpu-code"], capture_output=True, text=True, check=True).stdout.split()
     archs = [arch for arch in ("80", "90", "100", "120") if f"sm_{arch}" in known]
     assert "80" in archs
-    targets = [f"--generate-code=arch=compute_{arch},code=sm_{arch}" for arch in archs]
+    targets = f"--generate-code=arch=compute_80,code=[{','.join(f'sm_{arch}' for arch in archs)}]"  # as in the build
     flags = [
         "--fatbin",
         "-std=c++17",
@@ -56,13 +56,35 @@ def test_every_kernel_compiles_for_every_generation_of_gpus_and_keeps_its_sums_i
         str(tmp_path),
     ]
     sources = sorted(map(str, (KERNELS / "cuda").glob("*.cu")))
-    done = subprocess.run([NVCC, *flags, *targets, *sources], capture_output=True, text=True, timeout=300, check=False)
+    done = subprocess.run([NVCC, *flags, targets, *sources], capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
     assert len(list(tmp_path.iterdir())) == len(sources)
     # Of the kernels in float32 that training spends its time in.
     frames = re.findall(r"Function properties for \S+(blend_\w+If\S+)\n\s*(\d+) bytes stack frame", done.stderr)
     assert len(frames) >= 6 * len(archs)
     assert not [name for name, stack in frames if int(stack) > 32]  # an array of sums takes 64 bytes or more
+
+
+@pytest.mark.skipif(not shutil.which("cmake"), reason="no CMake")
+def test_a_build_that_fails_leaves_its_reason_for_doctor_and_lets_the_other_libraries_be(tmp_path, monkeypatch):
+    compiler = tmp_path / "nvcc"
+    compiler.write_text("#!/bin/sh\necho 'nvcc fatal : Unsupported gpu architecture'; exit 1\n")
+    compiler.chmod(0o755)
+    folder = tmp_path / "_native"
+    folder.mkdir()
+    places = {
+        "nvcc": compiler,
+        "library": folder / "libcatacaustics_cuda.so",
+        "failure": folder / "cuda_failure.txt",
+        "stamp": tmp_path / "built",
+    }
+    defined = [f"-D{name}={path}" for name, path in places.items()]
+    subprocess.run(["cmake", *defined, "-P", str(KERNELS / "cuda" / "build.cmake")], check=True, capture_output=True)
+    assert places["stamp"].exists()
+    monkeypatch.setattr(library, "_folders", lambda: [folder])
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    problem = library.find_library.__wrapped__("cuda").problem
+    assert problem == "it could not be built: nvcc fatal : Unsupported gpu architecture"
 
 
 @pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])

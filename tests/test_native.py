@@ -501,7 +501,7 @@ def test_every_variant_that_this_processor_runs_gives_the_same(monkeypatch):
     scene, camera = random_scene(2000, 6, dtype=torch.float32, size=0.05), front_camera(120, 90, 100.0)
     best = results(scene, camera, None, WIDE, "cpu")
     tried = 0
-    for path in sorted(find_library("cpu").library.path.parent.glob("*.so")):
+    for path in sorted(find_library("cpu").library.path.parent.glob("*_cpu*.so")):
         try:
             variant = load_library(path)
         except NativeError as error:
@@ -558,7 +558,7 @@ def test_another_library_is_refused_and_the_best_of_several_is_taken(tmp_path, m
         load_library(other)
     folder = tmp_path / "_native"
     folder.mkdir()
-    for installed in find_library("cpu").library.path.parent.glob("*.so"):
+    for installed in find_library("cpu").library.path.parent.glob("*_cpu*.so"):
         (folder / installed.name).write_bytes(installed.read_bytes())
     best = find_library("cpu").library.path.name  # the first that is tried
     (folder / best).write_bytes((folder / best).read_bytes()[:5000])

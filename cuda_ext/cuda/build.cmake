@@ -1,7 +1,8 @@
 # Runs nvcc; where it fails, leaves a line that says why instead of a library.
 file(REMOVE ${library} ${failure})
 execute_process(
-  COMMAND ${nvcc} -shared -cudart static -std=c++17 -O3 -Xcompiler=-fPIC,-fvisibility=hidden --threads 0 ${targets}
+  COMMAND ${nvcc} -shared -cudart static -std=c++17 -O3 -Xcompiler=-fPIC,-fvisibility=hidden --threads 0
+          "-gencode=arch=compute_80,code=[${codes}]"
           "-DCATACAUSTICS_ARCHS=${archs}" ${sources} -o ${library}
   RESULT_VARIABLE status
   OUTPUT_VARIABLE output
