@@ -17,6 +17,7 @@ from catacaustics.errors import UserError
 from catacaustics.images import read_image, read_image_bytes
 from catacaustics.reflectors.volume import build_volume
 from catacaustics.run import open_run
+from catacaustics.scene import Scene
 from catacaustics.training.initialize import Reflector, initial_scene, primary_seeds, reflection_seeds
 from catacaustics.web.viewer import Viewer, _quaternion, shifted_camera, window_camera
 
@@ -63,6 +64,26 @@ def test_a_run_in_training_is_opened_at_its_last_checkpoint_only_where_that_is_w
         open_run(run)
     opened = open_run(run, device="cpu", unfinished=True)
     assert len(opened.scene.primary) == len(scene.primary)
+
+
+def test_another_state_of_the_scene_takes_the_place_of_the_first(capture, scene, tmp_path):
+    scene.save(tmp_path / "scene.safetensors")
+    later = Scene.load(tmp_path / "scene.safetensors")
+    with torch.no_grad():
+        later.primary.positions += 1
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        port = free.getsockname()[1]
+    server = viser.ViserServer(host="127.0.0.1", port=port, verbose=False)
+    try:
+        viewer = Viewer(server, scene, capture, tmp_path, 480)
+        first = viewer.clouds["primary"].points.astype(float).mean(0)
+        assert list(viewer.clouds) == ["primary", "reflection ball"]
+        viewer.show(later)
+        np.testing.assert_allclose(viewer.clouds["primary"].points.astype(float).mean(0), first + 1, atol=0.01)
+        camera = capture.views[0].camera
+        assert torch.equal(viewer.render(camera).rgb, later.render(camera).rgb)
+    finally:
+        server.stop()
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="no chromium on this machine: apt-get install chromium (as .ci/run does)")
