@@ -91,6 +91,14 @@ struct Pack {
     }
 };
 
+template <class S>
+CATACAUSTICS_HD bool any(typename Pack<S>::Mask mask) {
+    uint64_t parts[sizeof mask / sizeof(uint64_t)], bits = 0;
+    memcpy(parts, &mask, sizeof mask);
+    for (uint64_t part : parts) bits |= part;
+    return bits != 0;
+}
+
 // 2^x for x in [-126, 0] (a relative error below 2 units in the last place); lanes below `floor` give 0.
 CATACAUSTICS_HD Pack<float> exp2_or_zero(Pack<float> x, float floor) {
     using P = Pack<float>;

@@ -80,7 +80,7 @@ class LiveBlocks {
 
    public:
     // Looked at after so many entries; a multiple of kGroup.
-    static constexpr int64_t kEvery = 64;
+    static constexpr int64_t kEvery = 128;
 
     void set_all() {
         std::memset(live_, 1, sizeof live_);
@@ -90,10 +90,7 @@ class LiveBlocks {
         count_ = 0;
         for (int block = 0; block < Shape::blocks; ++block) {
             const P t = P::load(through[block]);
-            const P left = select(t >= P(stop), t, P(S(0)));
-            S most = 0;
-            for (int lane = 0; lane < P::size; ++lane) most = left.v[lane] > most ? left.v[lane] : most;
-            live_[block] = most > S(0);
+            live_[block] = any<S>((t >= P(stop)) & (t > P(S(0))));
             count_ += live_[block];
         }
     }
