@@ -1,6 +1,8 @@
 """`catacaustics ablate`: what each part is worth, at equal time and at equal iterations, in one table and one chart."""
 
 import re
+import shutil
+import time
 from dataclasses import asdict, replace
 from html import escape
 from pathlib import Path
@@ -21,8 +23,10 @@ from catacaustics.scene import Scene
 from catacaustics.training.initialize import named_reflectors, usual_points
 from catacaustics.training.loop import device_of, fit
 from catacaustics.training.photographs import scaled_camera
+from catacaustics.training.selection import choose_models
 
-_PAPER: dict[str, dict[str, Any]] = {
+_ROWS: dict[str, dict[str, Any]] = {
+    "auto": {"model": ("auto",)},
     "primary only": {"model": ("none",)},
     "no densification": {"model": ("neural",), "densifications": 0},
     "no DSSIM, no TV": {"model": ("neural",), "weight_dssim": 0.0, "weight_tv": 0.0},
@@ -62,9 +66,8 @@ def ablate(config: AblateConfig) -> dict[str, Any]:
                     continue
                 print(f"ablation: {name}, {budget}, seed {seed}")
                 folder = out / "runs" / re.sub(r"\W+", "_", f"{name}_{budget}_{seed}")
-                folder.mkdir(parents=True, exist_ok=True)
-                for left in folder.iterdir():
-                    left.unlink()
+                shutil.rmtree(folder, ignore_errors=True)
+                folder.mkdir(parents=True)
                 train = TrainConfig(
                     config.capture, folder, image_size=config.image_size, seed=seed, device=config.device
                 )
@@ -82,7 +85,7 @@ def ablate(config: AblateConfig) -> dict[str, Any]:
 def _rows(config: AblateConfig, capture: Capture, volumes: list[ReflectionVolume]) -> dict[str, dict[str, Any]]:
     train = TrainConfig(config.capture, config.out, image_size=config.image_size)
     usual = usual_points(capture, volumes, train)["reflection_points"]
-    rows = {k: dict(v) for k, v in _PAPER.items()} | {r: {"model": (r,)} for r in _RUNGS}
+    rows = {k: dict(v) for k, v in _ROWS.items()} | {r: {"model": (r,)} for r in _RUNGS}
     rows["half warp"]["warp_width"] = train.warp_width // 2
     for rung in config.cloud_rungs:
         for share in _CLOUDS[:-1]:
@@ -100,11 +103,17 @@ def _train_row(capture: Capture, volumes: list[ReflectionVolume], config: TrainC
     def probe(scene: Scene, seconds: float, steps: int) -> None:
         curve.append({"seconds": seconds, "steps": steps} | held_out_scores(scene, capture, volumes, config))
 
-    scene = fit(capture, named_reflectors(volumes, config.model), config, probe)
+    started = time.monotonic()
+    chosen = choose_models(capture, volumes, config)
+    selection = time.monotonic() - started
+    scene = fit(capture, named_reflectors(volumes, chosen.model), chosen, probe)
+    for point in curve:  # what the trials took is part of the price
+        point["seconds"] += selection if chosen is not config else 0.0
     for heavy in ("checkpoint.safetensors", "scene.safetensors"):
         (config.run / heavy).unlink(missing_ok=True)
     flow = flow_error(scene.to("cpu"), capture)
     return {
+        "models": list(chosen.model),
         "curve": curve,
         "points": sum(len(c) for c in (scene.primary, *scene.reflections)),
         "flow_degrees": None if flow is None else flow.mean,
@@ -149,6 +158,7 @@ def summary(results: list[dict[str, Any]]) -> list[dict[str, Any]]:
             {
                 "name": name,
                 "budget": budget,
+                "models": same[0]["models"],
                 "seeds": len(same),
                 "spread": float(np.std([c["inside"] for c in last])),
                 "points": same[0]["points"],
@@ -165,7 +175,7 @@ _HEAD = ("row", "inside dB", "seeds", "whole dB", "flicker", "flow deg", "second
 def _cells(row: dict[str, Any]) -> list[str]:
     spread = f" +-{row['spread']:.2f}" if row["seeds"] > 1 else ""
     return [
-        row["name"],
+        row["name"] + (f" ({' '.join(row['models'])})" if row["name"] == "auto" else ""),
         f"{row['inside']:.2f}{spread}",
         str(row["seeds"]),
         f"{row['whole']:.2f}",

@@ -118,8 +118,8 @@ class TrainConfig:
     lr_position_final: float = 1.6e-6
     lr_source: float = 2e-3
     """Of reflection points' positions, relative to their distance from the reflector; decays to 1/10."""
-    lr_shape: float = 2e-3
-    """Of a mirror's position, radii and rotation, relative to its radius and in radians; decays to 1/10."""
+    lr_shape: float = 1e-2
+    """Of a mirror's position, radii and rotation, relative to its radius and in radians; decays to 1/50."""
     lr_normal: float = 1e-3
     lr_footprint: float = 5e-3
     lr_opacity: float = 5e-2

@@ -10,7 +10,18 @@ from catacaustics import cli
 from catacaustics.images import write_image
 
 SMALL = [
-    *("--iterations", "40", "--image-size", "64", "--primary-points", "2000", "--reflection-points", "200"),
+    *(
+        "--model",
+        "sphere",
+        "--iterations",
+        "40",
+        "--image-size",
+        "64",
+        "--primary-points",
+        "2000",
+        "--reflection-points",
+        "200",
+    ),
 ]
 
 

@@ -93,6 +93,13 @@ class ReflectionVolume:
         """Radius of the ball about `center` that holds the volume."""
         return float(np.linalg.norm(self.vertices - self.center, axis=-1).max())
 
+    def scaled(self, factor: float) -> "ReflectionVolume":
+        """Scaled about its centre."""
+        planes = self.halfspaces.copy()
+        offset = planes[:, :3] @ self.center
+        planes[:, 3] = factor * (planes[:, 3] + offset) - offset
+        return ReflectionVolume(self.name, planes, self.center + factor * (self.vertices - self.center), self.faces)
+
     def sample_surface(
         self, n: int, rng: np.random.Generator
     ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:

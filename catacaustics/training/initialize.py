@@ -6,11 +6,13 @@ import numpy as np
 import torch
 from torch import nn
 
-from catacaustics.capture.dataset import Capture
+from catacaustics.cameras import Camera, Viewport
+from catacaustics.capture.dataset import Capture, View
 from catacaustics.config import SplatConfig, TrainConfig
 from catacaustics.environment import EnvironmentMap
 from catacaustics.errors import UserError
 from catacaustics.images import resize
+from catacaustics.losses import dssim
 from catacaustics.reflectors.fit import fit_ellipsoid, fit_plane, fit_sphere, surroundings
 from catacaustics.reflectors.volume import ReflectionVolume
 from catacaustics.reflectors.warps import (
@@ -27,6 +29,10 @@ from catacaustics.shapes import Float
 from catacaustics.training.photographs import scaled_camera
 
 INITIAL_OPACITY = 0.8
+_SHRINKS = (1.0, 0.9, 0.8, 0.7, 0.6)
+"""Sizes of a quadric that are tried at the start, in units of the one that touches its volume."""
+_CLEARLY = 0.97
+"""A smaller start must lower the error to this share."""
 _SURFACE_SHARE = 0.3
 """Primary points on the reflectors' surfaces are at most this share of the cloud."""
 
@@ -235,6 +241,7 @@ def initial_scene(
     scene = Scene(primary, clouds, warps, volumes, environment, renderer, SplatConfig(near=near, alpha_min=1 / 255))
     if environment is not None:
         environment.start_from(*seen_through(capture, scene, config))
+    shrink_mirrors(scene, capture, config)
     return scene
 
 
@@ -252,6 +259,43 @@ def seen_through(
         parts.append((layers.directions.view(-1, 3), colors, layers.transmittance.reshape(-1)))
     directions, colors, weights = (torch.cat(p) for p in zip(*parts, strict=True))
     return directions, colors, weights
+
+
+def shrink_mirrors(scene: Scene, capture: Capture, config: TrainConfig, size: int = 120, views: int = 8) -> None:
+    """Start quadrics smaller than their volumes where the photographs say so: a volume from few or careless masks is
+    too large, and training does not find back from far. The surroundings are known in outline, so that a mirror of the
+    right size shows about the right picture; judged in the middle of the volume, which is mirror in any case."""
+    cameras = [(v, scaled_camera(v.camera, min(size, config.image_size), 1.0)) for v in capture.train]
+    cameras = cameras[:: max(1, len(cameras) // views)]
+    for warp, volume in zip(scene.warps, scene.volumes, strict=True):
+        quadric = warp.quadric if isinstance(warp, QuadricNeuralWarp) else warp
+        if not isinstance(quadric, QuadricWarp):
+            continue
+        core = volume.scaled(0.6)
+        errors = []
+        for factor in _SHRINKS:
+            with torch.no_grad():
+                quadric.log_radii.fill_(float(np.log(factor)))
+            errors.append(np.mean([_middle_error(scene, capture, core, *pair) for pair in cameras]))
+        best = int(np.argmin(errors))
+        if errors[best] > _CLEARLY * errors[0]:
+            best = 0
+        with torch.no_grad():
+            quadric.log_radii.fill_(float(np.log(_SHRINKS[best])))
+
+
+def _middle_error(scene: Scene, capture: Capture, core: ReflectionVolume, view: View, camera: Camera) -> float:
+    """L1 + DSSIM of a render in the box around the middle of a reflector."""
+    rows, columns = np.nonzero(core.project_mask(camera))
+    if not len(rows):
+        return 0.0
+    x0, y0 = int(columns.min()), int(rows.min())
+    box = Viewport(x0, y0, int(columns.max()) - x0 + 1, int(rows.max()) - y0 + 1)
+    photo = resize(capture.image(view), camera.width, camera.height)[y0 : y0 + box.height, x0 : x0 + box.width]
+    target = torch.from_numpy(np.ascontiguousarray(photo)).to(scene.device).float() / 255
+    with torch.no_grad():
+        image = scene.decode(scene.layers(camera, box))
+    return float((image - target).abs().mean() + dssim(image, target))
 
 
 def stage_count(seeds: Seeds, share: float) -> int:

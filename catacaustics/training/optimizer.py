@@ -28,7 +28,7 @@ def _rate(name: str, config: TrainConfig, extent: float, progress: float, warm_u
     if name.startswith("renderer.") or ".network." in name:
         return decay(config.lr_network, config.lr_network_final)
     if name.startswith("warps."):
-        return decay(config.lr_shape, config.lr_shape / 10)
+        return decay(config.lr_shape, config.lr_shape / 50)
     if name.startswith("reflections.") and kind == "positions":
         return decay(config.lr_source, config.lr_source / 10)  # times the row's distance from the reflector
     if kind == "positions":
