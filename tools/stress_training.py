@@ -2,8 +2,8 @@
 
     python tools/stress_training.py demo/capture --json stress.json
 
-Trains a capture's reflector many times: with 20 seeds, with its reflection volume 30 % too large, shifted by 20 % of its
-radius, and with noise of 1 pixel in the camera poses; prints the PSNR inside the true reflector on held-out views.
+Trains a capture's reflector many times: with 20 seeds, with its reflection volume 30 % too large, shifted by 20 % of
+its radius, and with noise of 1 pixel in the camera poses; prints the PSNR inside the true reflector on held-out views.
 """
 
 import shutil
@@ -144,10 +144,8 @@ def main(config: Stress) -> None:
             center, axes = shape()
             results[name]["radius"] = float(axes.detach().norm(dim=0).mean())
             results[name]["center"] = center.detach().tolist()
-        print(
-            f"{name:<32}{results[name]['inside']:7.2f} dB, {100 * results[name]['strayed']:.1f} % of the points astray",
-            flush=True,
-        )
+        inside, away = results[name]["inside"], 100 * results[name]["strayed"]
+        print(f"{name:<32}{inside:7.2f} dB, {away:.1f} % of the points astray", flush=True)
     seeds = [results[f"seed {i}"]["inside"] for i in range(config.seeds)]
     print(f"{config.seeds} seeds: median {np.median(seeds):.2f} dB, from {min(seeds):.2f} to {max(seeds):.2f}")
     if config.json is not None:

@@ -82,8 +82,8 @@ def align_view(
     without, because corrections of the training views leave the others where they were calibrated.
 
     Args:
-        camera, photo: of equal size, that of the training: a coarser image of a cloud has another look, and another best
-            pose.
+        camera, photo: of equal size, that of the training: a coarser image of a cloud looks different, and another pose
+            would fit it best.
     """
     corrections = Corrections(1, poses, exposure, extent).to(scene.device)
     if not list(corrections.parameters()):
