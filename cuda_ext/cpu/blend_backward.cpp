@@ -182,7 +182,8 @@ void reduce(
             for (int64_t tile = first_tile; tile < last_tile; ++tile) {
                 if (tile + 2 < last_tile) {
                     const int64_t ahead = next[tile + 2 - first_tile] - bins.begin(first_tile);
-                    for (int line = 0; line < 4; ++line) __builtin_prefetch(entry_gradients + ahead * stride + 16 * line);
+                    const S* row = entry_gradients + ahead * stride;
+                    for (int line = 0; line < 4; ++line) __builtin_prefetch(row + 16 * line);
                 }
                 const int32_t *entry = next[tile - first_tile], *tile_end = bins.end(tile);
                 const S* from = entry_gradients + (entry - bins.begin(first_tile)) * stride;

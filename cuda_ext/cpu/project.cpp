@@ -1,6 +1,5 @@
 #include <algorithm>
 #include <cmath>
-#include <limits>
 #include <vector>
 
 #include "../math/projection.h"
@@ -94,11 +93,11 @@ int64_t project_chunk(
     alignas(64) S out[8][P::size], reach[P::size];
     for (int64_t first = begin; first < end; first += P::size) {
         const int here = int(std::min<int64_t>(P::size, end - first));
-        const PointPack<S> pack(
-            points.positions, points.normals, points.footprints, [&](int lane) { return first + std::min(lane, here - 1); });
+        const auto point = [&](int lane) { return first + std::min(lane, here - 1); };
+        const PointPack<S> pack(points.positions, points.normals, points.footprints, point);
         const auto splat = screen_splat(view, project_disk(view, pack.p(), pack.n(), pack.s(), P(drawn.low_pass)));
         for (int lane = 0; lane < P::size; ++lane)
-            reach[lane] = drawn.cutoffs.reach2(points.opacities[first + std::min(lane, here - 1)]);
+            reach[lane] = drawn.cutoffs.reach2(points.opacities[point(lane)]);
         const auto touches = can_touch(splat, P::load(reach), drawn.frame);
         splat.mean_x.store(out[0]);
         splat.mean_y.store(out[1]);
@@ -271,8 +270,8 @@ int64_t finite(const S* values, int64_t count, int threads) {
 
 }  // namespace
 
-// means (count, 2), forms (count, 3) and visible (count) have room for all points; returns how many were written. In the
-// backward pass, gradients of points that are not visible are left as they are.
+// means (count, 2), forms (count, 3) and visible (count) have room for all points; returns how many were written. In
+// the backward pass, gradients of points that are not visible are left as they are.
 #define CATACAUSTICS_PROJECT(S, SUFFIX)                                                                                \
     CATACAUSTICS_EXPORT int64_t catacaustics_project_##SUFFIX(                                                         \
         const Run* run, int64_t count, const S* positions, const S* normals, const S* footprints, const S* opacities,  \

@@ -1,5 +1,5 @@
-// Memory that lives as long as a call. Large blocks ask for huge pages: touching 4 KiB pages one by one costs as much as
-// the work done in them.
+// Memory that lives as long as a call. Large blocks ask for huge pages: touching 4 KiB pages one by one costs as much
+// as the work done in them.
 #pragma once
 
 #include <cstdint>

@@ -57,11 +57,6 @@ struct Pack {
         r.v = *reinterpret_cast<const Raw*>(from);  // aligned
         return r;
     }
-    static CATACAUSTICS_HD Pack load_unaligned(const S* from) {
-        Pack r;
-        std::memcpy(&r.v, from, sizeof(Raw));
-        return r;
-    }
     CATACAUSTICS_HD void store(S* to) const { *reinterpret_cast<Raw*>(to) = v; }
 
     friend CATACAUSTICS_HD Pack operator+(Pack a, Pack b) { return Pack(a.v + b.v); }

@@ -153,7 +153,8 @@ CATACAUSTICS_HD int list_blocks(const LaneCoordinates<S>& at, const Record<S>& r
         const Mask number = to - from + 1;
         *reinterpret_cast<Mask*>(begin) = from;
         *reinterpret_cast<Mask*>(length) = number > 0 ? number : Mask{};
-        // Eight numbers are written at once, of which the first `length` count; four rows at once, few splats have more.
+        // Eight numbers are written at once, of which the first `length` count; four rows at once: few splats have
+        // more.
         const int here = last - row + 1 < P::size ? last - row + 1 : P::size;
         for (int i = 0; i < here; i += 4) {
             for (int k = i; k < i + 4; ++k) {

@@ -61,8 +61,8 @@ __global__ void find_starts(int64_t tiles, int64_t count, const uint32_t* sorted
     starts[tile] = low;
 }
 
-// The splats are sorted by depth already, so that a stable sort by tile alone sorts by (tile, depth): half the keys' bits
-// and a third of the passes, and points at equal depth keep their order.
+// The splats are sorted by depth already, so that a stable sort by tile alone sorts by (tile, depth): with half the
+// bits and a third of the passes; and points at equal depth keep their order.
 template <class S>
 int64_t bin(
     const Run& run, const Screen<S>& splats, const Window& window, const Cutoffs<S>& cutoffs, Record<S>* records,

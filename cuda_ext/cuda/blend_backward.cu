@@ -6,16 +6,16 @@ namespace {
 
 constexpr int kGeometry = 6;  // sums of a splat before those of the features, see PairSums
 
-// Where sums over a tile go: rows of kGeometry + C values, one for each splat, which tiles add to; or, so that the order
-// of additions is always the same, one for each entry.
+// Where sums over a tile go: rows of kGeometry + C values, one for each splat, which tiles add to; or, so that the
+// order of additions is always the same, one for each entry.
 template <class S>
 struct Sums {
     S* rows;
     bool by_entry;
 };
 
-// Two passes over each chunk of entries, chunks back to front: from the checkpoint in front of it, T of every pair; then
-// back to front, the gradients. Nothing is divided by.
+// Two passes over each chunk of entries, chunks back to front: from the checkpoint in front of it, T of every pair;
+// then, back to front, the gradients. Nothing is divided by.
 template <class S, int C>
 __global__ void __launch_bounds__(kBlock) blend_gradients(
     Splats<S> splats, Window window, S stop, Slice slice, const S* g_image, const S* g_transmittance,

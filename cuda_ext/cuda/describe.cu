@@ -2,6 +2,7 @@
 
 #define CATACAUSTICS_TEXT_OF(x) #x
 #define CATACAUSTICS_TEXT(x) CATACAUSTICS_TEXT_OF(x)
+#define CATACAUSTICS_CUDA CATACAUSTICS_TEXT(__CUDACC_VER_MAJOR__) "." CATACAUSTICS_TEXT(__CUDACC_VER_MINOR__)
 
 namespace catacaustics {
 namespace {
@@ -13,8 +14,7 @@ __global__ void probe() {}
 CATACAUSTICS_EXPORT int64_t catacaustics_abi() { return kAbi; }
 
 CATACAUSTICS_EXPORT const char* catacaustics_description() {
-    return CATACAUSTICS_TEXT(CATACAUSTICS_ARCHS) ", CUDA " CATACAUSTICS_TEXT(__CUDACC_VER_MAJOR__) "." CATACAUSTICS_TEXT(
-        __CUDACC_VER_MINOR__);
+    return CATACAUSTICS_TEXT(CATACAUSTICS_ARCHS) ", CUDA " CATACAUSTICS_CUDA;
 }
 
 // The last error; before any, why this system cannot run the library; empty where it can.

@@ -1,7 +1,7 @@
 // Calling kernels, and what the threads of a warp do together.
 //
-// The sources of this folder use CUDA by its C++ interface only, without the compiler's own syntax, so that tests can run
-// them on a CPU (tests/cuda_emulation).
+// The sources of this folder use CUDA by its C++ interface only, without the compiler's own syntax, so that tests can
+// run them on a CPU (tests/cuda_emulation).
 #pragma once
 
 #include <cuda_runtime.h>

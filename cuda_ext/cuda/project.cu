@@ -91,8 +91,8 @@ int64_t project(
     const Tally seen = read_back(run, tally);
     if (seen.invalid) return kInvalidValues;
     launch(
-        run, write_visible<S>, blocks_for(seen.visible), points, drawn.low_pass, seen.visible, numbers + n, means, forms,
-        visible);
+        run, write_visible<S>, blocks_for(seen.visible), points, drawn.low_pass, seen.visible, numbers + n, means,
+        forms, visible);
     return seen.visible;
 }
 

@@ -1,5 +1,5 @@
-// Tiles of 16 x 16 pixels, one block of threads each, a pixel a thread. A warp has 8 x 4 pixels: small splats then touch
-// few warps, and the others pass them by.
+// Tiles of 16 x 16 pixels, one block of threads each, a pixel a thread. A warp has 8 x 4 pixels: small splats then
+// touch few warps, and the others pass them by.
 #pragma once
 
 #include "../math/binning.h"

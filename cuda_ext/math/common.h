@@ -23,8 +23,6 @@ CATACAUSTICS_HD float square_root(float x) { return sqrtf(x); }
 CATACAUSTICS_HD double square_root(double x) { return sqrt(x); }
 CATACAUSTICS_HD float natural_log(float x) { return logf(x); }
 CATACAUSTICS_HD double natural_log(double x) { return log(x); }
-CATACAUSTICS_HD float absolute(float x) { return fabsf(x); }
-CATACAUSTICS_HD double absolute(double x) { return fabs(x); }
 
 // 2^x, or 0 below `floor`.
 CATACAUSTICS_HD float exp2_or_zero(float x, float floor) { return x >= floor ? exp2f(x) : 0.0f; }

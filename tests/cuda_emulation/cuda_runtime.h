@@ -1,7 +1,7 @@
 // Enough of CUDA to run the kernels of cuda_ext/cuda on one CPU core, block by block (x86-64, GCC or Clang).
 //
-// The threads of a block are fibers: each runs until it waits for its warp or its block, and goes on when all have come.
-// What a GPU leaves undefined ends the process with a message: threads that wait for others which never come, lanes of
+// The threads of a block are fibers: each runs until it waits for its warp or its block, and goes on when all have
+// come. What a GPU leaves undefined ends the process with a message: threads that wait for others which never come, lanes of
 // a warp that wait at different places. EMULATED_ORDER=reversed runs the last thread and the last block first: results
 // that depend on it show a missing barrier.
 #pragma once
