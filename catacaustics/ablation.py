@@ -46,6 +46,7 @@ def ablate(config: AblateConfig) -> dict[str, Any]:
         UserError: no capture, no held-out views, no reflector, or a row of that name.
     """
     capture, out = open_capture(config.capture), Path(config.out)
+    truth = capture if config.truth is None else open_capture(config.truth)
     volumes = [build_volume(capture, name) for name in capture.reflectors]
     if not capture.held_out or not volumes:
         missing = "held-out views" if volumes else "masks of a reflector"
@@ -71,7 +72,7 @@ def ablate(config: AblateConfig) -> dict[str, Any]:
                 train = TrainConfig(
                     config.capture, folder, image_size=config.image_size, seed=seed, device=config.device
                 )
-                result = _train_row(capture, volumes, replace(train, **limits, **settings))
+                result = _train_row(capture, volumes, replace(train, **limits, **settings), truth)
                 results.append({"name": name, "budget": budget, "seed": seed} | result)
                 write_json(path, {"key": key, "results": results})
     write_text(out / "ablation.html", _page(capture, config, results))
@@ -97,7 +98,9 @@ def _rows(config: AblateConfig, capture: Capture, volumes: list[ReflectionVolume
     return {k: v for k, v in rows.items() if not config.rows or k in config.rows}
 
 
-def _train_row(capture: Capture, volumes: list[ReflectionVolume], config: TrainConfig) -> dict[str, Any]:
+def _train_row(
+    capture: Capture, volumes: list[ReflectionVolume], config: TrainConfig, truth: Capture
+) -> dict[str, Any]:
     curve: list[dict[str, float]] = []
 
     def probe(scene: Scene, seconds: float, steps: int) -> None:
@@ -111,7 +114,7 @@ def _train_row(capture: Capture, volumes: list[ReflectionVolume], config: TrainC
         point["seconds"] += selection if chosen is not config else 0.0
     for heavy in ("checkpoint.safetensors", "scene.safetensors"):
         (config.run / heavy).unlink(missing_ok=True)
-    flow = flow_error(scene.to("cpu"), capture)
+    flow = flow_error(scene.to("cpu"), truth)
     return {
         "models": list(chosen.model),
         "curve": curve,

@@ -163,6 +163,8 @@ class AblateConfig:
     """One training a seed; the table gives means and spreads."""
     image_size: int = 480
     """Longer side of the photographs in training."""
+    truth: Path | None = None
+    """The capture with ground truth of reflections, where the calibrated one is a copy without."""
     json: Path | None = None
     """Write the results to this file too."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
