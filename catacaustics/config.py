@@ -42,8 +42,8 @@ class SplatConfig:
     alpha_min: float = 0.0
     """Contributions with less alpha are dropped; 0 is exact, 1/255 is common practice."""
     stop_transmittance: float = 0.0
-    """Early stop: what lies behind is not drawn in a pixel where transmittance has fallen below this; 0 is exact, 1e-4 is
-    common practice. Image and gradients belong to the same function."""
+    """Early stop: what lies behind is not drawn in a pixel where transmittance has fallen below this; 0 is exact, 1e-4
+    is common practice. Image and gradients belong to the same function."""
     near: float = 0.01
     """Points nearer to the camera plane than this (world units) are dropped."""
     guard_band: float = 0.5
@@ -52,7 +52,8 @@ class SplatConfig:
     pair_budget: int = 4_000_000
     """PyTorch only: splat-pixel pairs held at a time, about 60 bytes each; results do not depend on it."""
     deterministic: bool = False
-    """GPU only: gradients are the same bit for bit in every run, at the price of memory and time (on the CPU they are)."""
+    """GPU only: gradients are the same bit for bit in every run, for more memory and time (on the CPU they always
+    are)."""
 
     @classmethod
     def exact(cls, **settings: float) -> "SplatConfig":
