@@ -6,6 +6,8 @@ environment map is blended with the primary cloud's transmittance. (Paper sectio
 """
 
 import json
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
@@ -58,6 +60,19 @@ class PointParameters(nn.Module):
 
     def __len__(self) -> int:
         return len(self.positions)
+
+
+@contextmanager
+def frozen(module: nn.Module) -> Iterator[None]:
+    """No parameter of a module learns inside."""
+    learning = [p for p in module.parameters() if p.requires_grad]
+    for parameter in learning:
+        parameter.requires_grad_(False)
+    try:
+        yield
+    finally:
+        for parameter in learning:
+            parameter.requires_grad_(True)
 
 
 class Motion(NamedTuple):

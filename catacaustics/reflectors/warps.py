@@ -143,6 +143,33 @@ class QuadricNeuralWarp(nn.Module):
         return image._replace(positions=self.neural(image.positions, center).positions)
 
 
+class MovedWarp(nn.Module):
+    """A reflector that was moved together with what it mirrors: the image is computed for the camera as the reflector
+    would see it at its old place, then moved along. x_new = scale * rotation x_old + shift.
+
+    Physically right where the surroundings move too; a moved mirror in resting surroundings is a quadric of its own
+    with the old world points.
+    """
+
+    def __init__(
+        self, warp: nn.Module, scale: float, rotation: Float[Tensor, "3 3"], shift: Float[Tensor, "3"]
+    ):
+        super().__init__()
+        self.warp = warp
+        self.register_buffer("scale", torch.as_tensor(float(scale)))
+        self.register_buffer("rotation", rotation)
+        self.register_buffer("shift", shift)
+
+    def forward(self, points: Points, center: Float[Tensor, "3"], start: Points | None = None) -> Displayed:
+        old_center = (center - self.shift) @ self.rotation / self.scale
+        shown = self.warp(points, old_center, start)
+        return shown._replace(
+            positions=self.scale * shown.positions @ self.rotation.T + self.shift,
+            normals=None if shown.normals is None else shown.normals @ self.rotation.T,
+            stretch=self.scale**2 * (torch.ones_like(points[:, 0]) if shown.stretch is None else shown.stretch),
+        )
+
+
 def learns_positions(warp: nn.Module) -> bool:
     """Whether a cloud's points move in training: the network alone displaces points that stay fixed (paper 4.2)."""
     return not isinstance(warp, NeuralWarp)
@@ -150,6 +177,9 @@ def learns_positions(warp: nn.Module) -> bool:
 
 def warp_from_state(state: dict[str, Tensor]) -> nn.Module:
     """The warp that a state dictionary belongs to, filled."""
+    if "shift" in state and "rotation" in state:
+        inner = warp_from_state({k.removeprefix("warp."): v for k, v in state.items() if k.startswith("warp.")})
+        return MovedWarp(inner, float(state["scale"]), state["rotation"], state["shift"])
     if "quadric.start_axes" in state:
         parts = {
             part: warp_from_state({k.removeprefix(f"{part}."): v for k, v in state.items() if k.startswith(f"{part}.")})

@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from catacaustics.cameras import Camera
 from catacaustics.losses import dssim
-from catacaustics.scene import Motion, Scene
+from catacaustics.scene import Motion, Scene, frozen
 from catacaustics.shapes import Float
 
 
@@ -88,10 +88,7 @@ def align_view(
     corrections = Corrections(1, poses, exposure, extent).to(scene.device)
     if not list(corrections.parameters()):
         return Alignment(corrections)
-    frozen = [p for p in scene.parameters() if p.requires_grad]
-    for parameter in frozen:
-        parameter.requires_grad_(False)
-    try:
+    with frozen(scene):
         groups = [{"params": [p], "lr": rate} for p, rate in zip(corrections.parameters(), _rates(poses), strict=False)]
         optimizer = torch.optim.Adam(groups)
         schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, steps, 1e-5)
@@ -102,9 +99,6 @@ def align_view(
             loss.backward()
             optimizer.step()
             schedule.step()
-    finally:
-        for parameter in frozen:
-            parameter.requires_grad_(True)
     return Alignment(corrections)
 
 

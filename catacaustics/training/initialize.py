@@ -24,15 +24,15 @@ from catacaustics.reflectors.warps import (
     learns_positions,
 )
 from catacaustics.renderer import FEATURES, NeuralRenderer
-from catacaustics.scene import PointParameters, Scene
+from catacaustics.scene import PointParameters, Scene, frozen
 from catacaustics.shapes import Float
 from catacaustics.training.photographs import scaled_camera
 
 INITIAL_OPACITY = 0.8
-_SHRINKS = (1.0, 0.9, 0.8, 0.7, 0.6)
-"""Sizes of a quadric that are tried at the start, in units of the one that touches its volume."""
-_CLEARLY = 0.97
-"""A smaller start must lower the error to this share."""
+_SIZES = (1.0, 0.8, 0.65)
+"""Sizes that a quadric is fitted from, in units of the one that touches its volume."""
+_SHAPE_STEPS, _SHAPE_SIZE = 30, 120
+"""Steps of each fit, and the longer side of its images."""
 _SURFACE_SHARE = 0.3
 """Primary points on the reflectors' surfaces are at most this share of the cloud."""
 
@@ -238,10 +238,10 @@ def initial_scene(
     ]
     volumes = [r.volume for r in reflectors]
     near = 1e-2 * scene_extent(capture)
-    scene = Scene(primary, clouds, warps, volumes, environment, renderer, SplatConfig(near=near, alpha_min=1 / 255))
+    scene = Scene(primary, clouds, warps, volumes, environment, renderer, SplatConfig.fast(near=near))
     if environment is not None:
         environment.start_from(*seen_through(capture, scene, config))
-    shrink_mirrors(scene, capture, config)
+    start_shapes(scene, capture, config)
     return scene
 
 
@@ -261,41 +261,71 @@ def seen_through(
     return directions, colors, weights
 
 
-def shrink_mirrors(scene: Scene, capture: Capture, config: TrainConfig, size: int = 120, views: int = 8) -> None:
-    """Start quadrics smaller than their volumes where the photographs say so: a volume from few or careless masks is
-    too large, and training does not find back from far. The surroundings are known in outline, so that a mirror of the
-    right size shows about the right picture; judged in the middle of the volume, which is mirror in any case."""
-    cameras = [(v, scaled_camera(v.camera, min(size, config.image_size), 1.0)) for v in capture.train]
-    cameras = cameras[:: max(1, len(cameras) // views)]
-    for warp, volume in zip(scene.warps, scene.volumes, strict=True):
-        quadric = warp.quadric if isinstance(warp, QuadricNeuralWarp) else warp
-        if not isinstance(quadric, QuadricWarp):
-            continue
-        core = volume.scaled(0.6)
-        errors = []
-        for factor in _SHRINKS:
-            with torch.no_grad():
-                quadric.log_radii.fill_(float(np.log(factor)))
-            errors.append(np.mean([_middle_error(scene, capture, core, *pair) for pair in cameras]))
-        best = int(np.argmin(errors))
-        if errors[best] > _CLEARLY * errors[0]:
-            best = 0
+def start_shapes(scene: Scene, capture: Capture, config: TrainConfig) -> None:
+    """Fit every quadric to the photographs while everything else stands still, from several sizes; the best remains.
+
+    A volume from few or careless masks is too large, and a convex hull has handles and spouts in it; training does not
+    find back from far. The surroundings are known in outline, so that a mirror of the right shape shows about the right
+    picture. Judged in the middle of the volume, which is mirror in any case.
+    """
+    cameras = [(v, scaled_camera(v.camera, min(_SHAPE_SIZE, config.image_size), 1.0)) for v in capture.train]
+    cameras = cameras[:: max(1, len(cameras) // 10)]
+    with frozen(scene):
+        for warp, volume in zip(scene.warps, scene.volumes, strict=True):
+            quadric = warp.quadric if isinstance(warp, QuadricNeuralWarp) else warp
+            if isinstance(quadric, QuadricWarp):
+                boxes = [_middle_box(volume.scaled(0.6), camera) for _, camera in cameras]
+                seen = [(v, c, box) for (v, c), box in zip(cameras, boxes, strict=True) if box is not None]
+                if seen:
+                    _start_shape(scene, capture, quadric, seen)
+
+
+def _start_shape(
+    scene: Scene, capture: Capture, quadric: QuadricWarp, cameras: list[tuple[View, Camera, Viewport]]
+) -> None:
+    parameters = list(quadric.parameters())
+    targets = []
+    for view, camera, box in cameras:
+        photo = resize(capture.image(view), camera.width, camera.height)
+        photo = photo[box.y0 : box.y0 + box.height, box.x0 : box.x0 + box.width]
+        targets.append(torch.from_numpy(np.ascontiguousarray(photo)).to(scene.device).float() / 255)
+
+    def error(i: int) -> torch.Tensor:
+        image = scene.decode(scene.layers(cameras[i][1], cameras[i][2]))
+        return (image - targets[i]).abs().mean() + dssim(image, targets[i])
+
+    found = []
+    for size in _SIZES:
         with torch.no_grad():
-            quadric.log_radii.fill_(float(np.log(_SHRINKS[best])))
+            for parameter in parameters:
+                parameter.zero_()
+            quadric.log_radii.fill_(float(np.log(size)))
+        for parameter in parameters:
+            parameter.requires_grad_(True)
+        optimizer = torch.optim.Adam(parameters, 0.02)
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, _SHAPE_STEPS, 1e-3)
+        for step in range(_SHAPE_STEPS):
+            optimizer.zero_grad()
+            error(step % len(cameras)).backward()
+            optimizer.step()
+            schedule.step()
+        for parameter in parameters:
+            parameter.requires_grad_(False)
+        total = float(sum(float(error(i)) for i in range(len(cameras))))
+        found.append((total if np.isfinite(total) else np.inf, [p.detach().clone() for p in parameters]))
+    best = min(found, key=lambda pair: pair[0])[1]
+    with torch.no_grad():
+        for parameter, value in zip(parameters, best, strict=True):
+            parameter.copy_(value)
 
 
-def _middle_error(scene: Scene, capture: Capture, core: ReflectionVolume, view: View, camera: Camera) -> float:
-    """L1 + DSSIM of a render in the box around the middle of a reflector."""
+def _middle_box(core: ReflectionVolume, camera: Camera) -> Viewport | None:
+    """The box around a volume in a view; None where it is not seen."""
     rows, columns = np.nonzero(core.project_mask(camera))
     if not len(rows):
-        return 0.0
+        return None
     x0, y0 = int(columns.min()), int(rows.min())
-    box = Viewport(x0, y0, int(columns.max()) - x0 + 1, int(rows.max()) - y0 + 1)
-    photo = resize(capture.image(view), camera.width, camera.height)[y0 : y0 + box.height, x0 : x0 + box.width]
-    target = torch.from_numpy(np.ascontiguousarray(photo)).to(scene.device).float() / 255
-    with torch.no_grad():
-        image = scene.decode(scene.layers(camera, box))
-    return float((image - target).abs().mean() + dssim(image, target))
+    return Viewport(x0, y0, int(columns.max()) - x0 + 1, int(rows.max()) - y0 + 1)
 
 
 def stage_count(seeds: Seeds, share: float) -> int:

@@ -118,11 +118,14 @@ def _start(
 ) -> TrainState:
     path = Path(config.run) / "checkpoint.safetensors"
     if not path.exists():
+        started = time.monotonic()  # fitting the mirrors' shapes is training
         scene = initial_scene(capture, reflectors, seeds, STAGES[0].points, config).to(device_of(config))
         (Path(config.run) / "metrics.jsonl").unlink(missing_ok=True)
         statistics = GradientStatistics(len(scene.primary), scene.device)
         corrections = _corrections(capture, config)
-        return TrainState(scene, corrections, make_optimizer(scene, config, corrections), rng, statistics)
+        optimizer = make_optimizer(scene, config, corrections)
+        seconds = time.monotonic() - started
+        return TrainState(scene, corrections, optimizer, rng, statistics, seconds=seconds)
     scene, tensors, notes = Scene.load_with_extras(path, device_of(config))
     corrections = _corrections(capture, config)
     corrections.load_state_dict({k: tensors[f"corrections.{k}"] for k in corrections.state_dict()})

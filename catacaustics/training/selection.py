@@ -33,17 +33,16 @@ LADDER = ("none", "static", "plane", "sphere", "ellipsoid", "concave", "neural",
 LEAST_GAIN = 0.2
 """dB that a more complex candidate must gain at least."""
 
-_SHARE = 0.25
+_SHARE = 0.3
 """Of the training's minutes, spent on all trials together."""
 _STEPS = 400
 """Steps of a trial at most; without a time limit, all of them are done."""
-_SIZE = 240
-"""Longer side of the images in trials."""
-_PATCH = 120
+_SIZE, _PATCH = 200, 100
+"""Longer side of the images, and of the patches, in trials."""
 _FACTORS = (0.5, 1.0, 2.0)
 """Sizes of a cloud that are tried, in units of `usual_points`."""
-_PATIENT = 15
-"""Minutes of training from which on corrections of the photographs are tried."""
+_PATIENT = 10
+"""Minutes of training from which on sizes of clouds and corrections of the photographs are tried."""
 _VIEWS = 8
 """Validation views at most."""
 
@@ -110,6 +109,7 @@ def choose_models(capture: Capture, volumes: list[ReflectionVolume], config: Tra
         for i, r in enumerate(reflectors)
     ]
     chosen: dict = {"model": tuple(models)}
+    hurried = config.minutes is not None and config.minutes < _PATIENT  # usual sizes, photographs as they are
     taken = {"model": models}
     if config.environment_width:
         without = trials.run("no environment map", "environment", chosen | {"environment_width": 0})
@@ -118,7 +118,7 @@ def choose_models(capture: Capture, volumes: list[ReflectionVolume], config: Tra
             chosen["environment_width"] = 0
         taken["environment"] = [(without, base)[best([without.whole, base.whole])].name]
     for question, field in (("reflection points", "reflection_points"), ("primary points", "primary_points")):
-        if getattr(config, field) is not None or (field == "reflection_points" and set(models) == {"none"}):
+        if hurried or getattr(config, field) is not None or (field == "reflection_points" and set(models) == {"none"}):
             continue
         usual = usual_points(capture, volumes, trials.config)[field]
         tried = {f"{int(factor * usual):,} ({factor:g} x usual)": {field: int(factor * usual)} for factor in _FACTORS}
@@ -126,17 +126,16 @@ def choose_models(capture: Capture, volumes: list[ReflectionVolume], config: Tra
         index = best([_joined(t) if field == "reflection_points" else t.whole for t in done])
         taken[question] = [done[index].name]
         chosen[field] = int(_FACTORS[index] * usual_points(capture, volumes, config)[field])
-    chosen |= _photographs(trials, config, chosen, taken)
+    chosen |= {} if hurried else _photographs(trials, config, chosen, taken)
     trials.finish(chosen, taken, [v.name for v in volumes])
     minutes = None if config.minutes is None else max(config.minutes - trials.seconds / 60, 0.25 * config.minutes)
     return replace(config, minutes=minutes, **chosen)
 
 
 def _photographs(trials: "_Trials", config: TrainConfig, chosen: dict, taken: dict[str, list[str]]) -> dict:
-    """Do poses or exposures need corrections? Scored on views aligned in both, so that neither has an advantage. Short
-    trainings do without: what is not asked stays off."""
+    """Do poses or exposures need corrections? Scored on views aligned in both, so that neither has an advantage."""
     free = [key for key in ("refine_poses", "exposure") if getattr(config, key) is None]
-    if not free or (config.minutes is not None and config.minutes < _PATIENT):
+    if not free:
         return {}
     names = {"refine_poses": "camera poses", "exposure": "exposure"}
     options: list[dict] = [{key: False for key in free}]
@@ -170,7 +169,7 @@ class _Trials:
         self.capture = replace(capture, train=[v for v in views if v not in self.validation], held_out=[])
         self.volumes = volumes
         self.run_folder = Path(config.run)
-        trials = len(LADDER) + (6 if config.minutes is None or config.minutes < _PATIENT else 10)
+        trials = len(LADDER) + (1 if config.minutes is not None and config.minutes < _PATIENT else 11)
         size = min(_SIZE, config.image_size)
         named = {k: getattr(config, k) for k in ("primary_points", "reflection_points")}
         self.config = replace(
