@@ -13,8 +13,7 @@ $(VENV)/installed: pyproject.toml constraints.txt
 	touch $@
 
 demo: $(VENV)/installed
-	$(BIN)/catacaustics reconstruct data_samples/ball $(DEMO) --minutes 6 --image-size 480 \
-		--primary-points 60000 --reflection-points 8000 --warp-width 128
+	$(BIN)/catacaustics reconstruct data_samples/ball $(DEMO) --minutes 4 --image-size 480
 	$(BIN)/catacaustics render $(DEMO)/run $(DEMO)/film.mp4 --width 480 --seconds 5
 
 test: $(VENV)/installed

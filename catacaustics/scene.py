@@ -1,8 +1,9 @@
 """The scene: point clouds, warps, environment and renderer; rendered from any camera, saved to one file.
 
 Primary points carry 6 features and rho, the weight of the reflection, which is splatted as a 7th channel so that
-nearer diffuse occluders hide the reflector. Primary features are scaled by 1 - rho, reflection features by rho. The
-environment map is blended with the primary cloud's transmittance. (Paper sections 4 and 5; the sense of rho is ours.)
+nearer diffuse occluders hide the reflector. Reflection features are scaled by rho, primary features by 1 - rho where a
+reflection is: the paper does so everywhere, but a volume can be larger than what mirrors. The environment map is
+blended with the primary cloud's transmittance. (Paper sections 4 and 5; the sense of rho is ours.)
 """
 
 import json
@@ -100,7 +101,7 @@ class Layers(NamedTuple):
 
 class RenderOutput(NamedTuple):
     """A rendered view. `primary_rgb` is the scene without reflections, `reflection_rgb` reflections alone, unweighted;
-    `reflection_weight` is rho; `alpha` the opacity of the primary cloud; `depth` its mean depth (0 where empty)."""
+    `reflection_weight` is the share of the reflection; `alpha` the opacity of the primary cloud; `depth` its mean depth (0 where empty)."""
 
     rgb: Float[Tensor, "height width 3"]
     primary_rgb: Float[Tensor, "height width 3"]
@@ -185,7 +186,7 @@ class Scene(nn.Module):
                 self._decode_strips(*_weighted(layers), layers.directions),
                 self._decode_strips(layers.primary, nothing, layers.directions),
                 self._decode_strips(nothing, layers.reflection, layers.directions),
-                layers.rho,
+                layers.rho * (1 - layers.reflection_transmittance),
                 1 - layers.transmittance,
                 layers.depth,
             )
@@ -311,9 +312,10 @@ class Scene(nn.Module):
 
 
 def _weighted(layers: Layers) -> tuple[Tensor, Tensor]:
-    """Primary features scaled by 1 - rho, reflection features by rho."""
+    """Primary features scaled by 1 - w, reflection features by rho (premultiplied by their opacity); w = rho times the
+    reflection's opacity: where a mirror shows no reflection, what was learned of its surface remains."""
     rho = layers.rho[..., None]
-    return (1 - rho) * layers.primary, rho * layers.reflection
+    return (1 - rho * (1 - layers.reflection_transmittance[..., None])) * layers.primary, rho * layers.reflection
 
 
 def _stretched(footprints: Tensor, shown: Displayed) -> Tensor:

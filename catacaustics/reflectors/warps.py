@@ -151,9 +151,7 @@ class MovedWarp(nn.Module):
     with the old world points.
     """
 
-    def __init__(
-        self, warp: nn.Module, scale: float, rotation: Float[Tensor, "3 3"], shift: Float[Tensor, "3"]
-    ):
+    def __init__(self, warp: nn.Module, scale: float, rotation: Float[Tensor, "3 3"], shift: Float[Tensor, "3"]):
         super().__init__()
         self.warp = warp
         self.register_buffer("scale", torch.as_tensor(float(scale)))

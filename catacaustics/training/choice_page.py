@@ -38,7 +38,7 @@ def choice_html(folder: Path, result: dict[str, Any], least_gain: float) -> str:
     rule = (
         "Candidates of a question stand in order of complexity. A more complex one is taken only if its mean gain over "
         f"the best so far exceeds both {least_gain:g} dB and twice the standard error of the gain per view. Scores are "
-        "means over training views that the trials did not see; every trial had the same time."
+        "means over training views that the trials did not see; every trial had the same number of steps."
     )
     sections = []
     for question, (title, measure) in _TITLES.items():

@@ -3,7 +3,7 @@
 The rule. Rungs are walked from the simplest to the most complex. A more complex one takes the place of the best so far
 only if its mean gain in PSNR inside the reflector exceeds both 0.2 dB and twice the standard error of the gains per
 view: what the noise of a few views could explain is not a reason. The environment map and larger clouds must earn their
-place by the same rule, judged on the whole image and inside the reflectors. All trials get the same seconds.
+place by the same rule, judged on the whole image and inside the reflectors. All trials get the same steps.
 """
 
 import shutil
@@ -33,10 +33,8 @@ LADDER = ("none", "static", "plane", "sphere", "ellipsoid", "concave", "neural",
 LEAST_GAIN = 0.2
 """dB that a more complex candidate must gain at least."""
 
-_SHARE = 0.3
-"""Of the training's minutes, spent on all trials together."""
-_STEPS = 400
-"""Steps of a trial at most; without a time limit, all of them are done."""
+_STEPS, _HURRIED_STEPS = 250, 80
+"""Steps of a trial, and where there are less than `_PATIENT` minutes."""
 _SIZE, _PATCH = 200, 100
 """Longer side of the images, and of the patches, in trials."""
 _FACTORS = (0.5, 1.0, 2.0)
@@ -109,7 +107,7 @@ def choose_models(capture: Capture, volumes: list[ReflectionVolume], config: Tra
         for i, r in enumerate(reflectors)
     ]
     chosen: dict = {"model": tuple(models)}
-    hurried = config.minutes is not None and config.minutes < _PATIENT  # usual sizes, photographs as they are
+    hurried = _hurried(config)  # usual sizes, photographs as they are
     taken = {"model": models}
     if config.environment_width:
         without = trials.run("no environment map", "environment", chosen | {"environment_width": 0})
@@ -150,6 +148,10 @@ def _photographs(trials: "_Trials", config: TrainConfig, chosen: dict, taken: di
     return options[index]
 
 
+def _hurried(config: TrainConfig) -> bool:
+    return config.minutes is not None and config.minutes < _PATIENT
+
+
 def _filled(reflectors: list, rung: str) -> tuple[str, ...]:
     return tuple(rung if r.model == "auto" else r.model for r in reflectors)
 
@@ -169,15 +171,14 @@ class _Trials:
         self.capture = replace(capture, train=[v for v in views if v not in self.validation], held_out=[])
         self.volumes = volumes
         self.run_folder = Path(config.run)
-        trials = len(LADDER) + (1 if config.minutes is not None and config.minutes < _PATIENT else 11)
         size = min(_SIZE, config.image_size)
         named = {k: getattr(config, k) for k in ("primary_points", "reflection_points")}
         self.config = replace(
             config,
             **{k: n and max(500, int(n * (size / config.image_size) ** 2)) for k, n in named.items()},
             image_size=size,
-            iterations=min(_STEPS, config.iterations),
-            minutes=None if config.minutes is None else _SHARE * config.minutes / trials,
+            iterations=min(_HURRIED_STEPS if _hurried(config) else _STEPS, config.iterations),
+            minutes=None,
             patch=_PATCH,
             accumulate=1,
             environment_width=min(config.environment_width, 200),
