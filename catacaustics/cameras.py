@@ -64,6 +64,13 @@ class Camera:
             self, width=width, height=height, fx=self.fx * sx, fy=self.fy * sy, cx=self.cx * sx, cy=self.cy * sy
         )
 
+    def displaced(self, offset: Float[np.ndarray, "3"]) -> "Camera":
+        """The camera displaced along its own axes (right, down, forward; world units). As a warp camera it moves
+        reflections and nothing else."""
+        pose = self.camera_from_world.copy()
+        pose[:3, 3] -= offset
+        return replace(self, camera_from_world=pose)
+
     def project(self, points: Float[np.ndarray, "*n 3"]) -> tuple[Float[np.ndarray, "*n 2"], Float[np.ndarray, "*n"]]:
         """Pixel coordinates (x, y) and depth z of world points. Points with z <= 0 are behind the camera: check z."""
         p = transform(self.camera_from_world, points)

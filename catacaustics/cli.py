@@ -16,6 +16,8 @@ _COMMANDS = {
     "ablate": ("catacaustics.ablation", "ablate", "AblateConfig"),
     "view": ("catacaustics.web.viewer", "view", "ViewConfig"),
     "render": ("catacaustics.video", "render_video", "RenderConfig"),
+    "edit": ("catacaustics.editing", "edit", "EditConfig"),
+    "clone": ("catacaustics.editing", "clone", "CloneConfig"),
     "doctor": ("catacaustics.doctor", "doctor", "DoctorConfig"),
 }
 

@@ -197,6 +197,8 @@ class RenderConfig:
     """held-out: through the held-out views in order; spline: a tour of the training views, nearest neighbour next."""
     layers: tuple[Literal["rgb", "primary", "reflection", "weight", "depth"], ...] = ("rgb",)
     """What to show; several layers stand side by side."""
+    warp_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Reflections follow a camera displaced by this along the view's axes (right, down, forward; world units)."""
     seconds: float = 10.0
     """Length of the video."""
     fps: float = 24.0
@@ -209,6 +211,44 @@ class RenderConfig:
     """The capture, where it is no longer at the place that training noted."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
     """Where to render; auto takes the GPU if there is one."""
+
+
+@dataclass(frozen=True)
+class EditConfig:
+    """Change a scene's reflections; writes a new run that can be rendered, viewed and edited again."""
+
+    run: Path
+    """Folder that training wrote."""
+    out: Path
+    """Folder to write."""
+    reflector: str | None = None
+    """Name of the reflector, where there are several."""
+    strength: float = 1.0
+    """Brightness of the reflections; 0 erases them."""
+    tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    """Colour that reflections are multiplied with (RGB)."""
+    surroundings: Path | None = None
+    """Latitude-longitude image that the reflector shall mirror instead."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+
+
+@dataclass(frozen=True)
+class CloneConfig:
+    """Copy a reflector with its reflections to another place; writes a new run."""
+
+    run: Path
+    """Folder that training wrote."""
+    out: Path
+    """Folder to write."""
+    shift: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Where to, from the original, in world units."""
+    turn: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Rotation in degrees, as a vector along its axis."""
+    scale: float = 1.0
+    """Size of the copy."""
+    reflector: str | None = None
+    """Name of the reflector, where there are several."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
 
 
 @dataclass(frozen=True)

@@ -101,7 +101,8 @@ class Layers(NamedTuple):
 
 class RenderOutput(NamedTuple):
     """A rendered view. `primary_rgb` is the scene without reflections, `reflection_rgb` reflections alone, unweighted;
-    `reflection_weight` is the share of the reflection; `alpha` the opacity of the primary cloud; `depth` its mean depth (0 where empty)."""
+    `reflection_weight` is the reflection's share; `alpha` the opacity of the primary cloud; `depth` its mean depth (0
+    where empty)."""
 
     rgb: Float[Tensor, "height width 3"]
     primary_rgb: Float[Tensor, "height width 3"]

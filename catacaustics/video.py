@@ -33,9 +33,12 @@ def render_video(config: RenderConfig) -> Path:
     run = open_run(config.run, config.capture, config.device)
     cameras = camera_path(run, config)
     video = Path(config.video)
-    frames = video.parent / f"{video.stem}-frames-{_key(run.folder, cameras, config.layers)}"
+    offset = np.array(config.warp_offset)
+    frames = video.parent / f"{video.stem}-frames-{_key(run.folder, cameras, config.layers, offset)}"
     depths = _path_depths(run.scene, cameras) if "depth" in config.layers else (0.0, 1.0)
-    count = write_video(video, _frames(run.scene, cameras, config.layers, depths, frames), config.fps, config.quality)
+    count = write_video(
+        video, _frames(run.scene, cameras, offset, config.layers, depths, frames), config.fps, config.quality
+    )
     shutil.rmtree(frames, ignore_errors=True)
     print(f"video: {count} frames, {count / config.fps:.1f} s: {video}")
     return video
@@ -104,10 +107,11 @@ def _check(config: RenderConfig) -> None:
         )
 
 
-def _key(folder: Path, cameras: Sequence[Camera], layers: Sequence[str]) -> str:
+def _key(folder: Path, cameras: Sequence[Camera], layers: Sequence[str], offset: Float[np.ndarray, "3"]) -> str:
     """Names everything that a frame's pixels depend on."""
     digest = hashlib.sha256((folder / "scene.safetensors").read_bytes())
     digest.update(repr((catacaustics.__version__, tuple(layers), len(cameras))).encode())
+    digest.update(offset.tobytes())
     for c in cameras:
         digest.update(repr((c.width, c.height, c.fx, c.fy, c.cx, c.cy)).encode() + c.camera_from_world.tobytes())
     return digest.hexdigest()[:12]
@@ -120,13 +124,19 @@ def _path_depths(scene: Scene, cameras: Sequence[Camera]) -> tuple[float, float]
     return min(near for near, _ in ranges), max(far for _, far in ranges)
 
 
-def _render(scene: Scene, camera: Camera) -> RenderOutput:
+def _render(scene: Scene, camera: Camera, offset: Float[np.ndarray, "3"] | None = None) -> RenderOutput:
     with torch.no_grad():
-        return scene.render(camera)
+        moves = offset is not None and offset.any()
+        return scene.render(camera, warp_camera=camera.displaced(offset)) if moves else scene.render(camera)
 
 
 def _frames(
-    scene: Scene, cameras: Sequence[Camera], layers: Sequence[Layer], depths: tuple[float, float], folder: Path
+    scene: Scene,
+    cameras: Sequence[Camera],
+    offset: Float[np.ndarray, "3"],
+    layers: Sequence[Layer],
+    depths: tuple[float, float],
+    folder: Path,
 ) -> Iterator[np.ndarray]:
     """The film's frames; those in the folder are read, the others rendered and put there."""
     paths = [folder / f"{i:05d}.png" for i in range(len(cameras))]
@@ -135,6 +145,6 @@ def _frames(
         print(f"video: {finished} of {len(paths)} frames are finished already, kept")
     for path, camera in zip(tqdm(paths, desc="video", unit="frame"), cameras, strict=True):
         if not path.is_file():
-            output = _render(scene, camera)
+            output = _render(scene, camera, offset)
             write_image(path, np.concatenate([layer_image(output, layer, depths) for layer in layers], 1))
         yield read_image_bytes(path)

@@ -36,6 +36,7 @@ FLOORS = [
     "evaluation",
     "catacaustic",
     "ablation",
+    "editing",
     "video",
     "reconstruct",
     "web",

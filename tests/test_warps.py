@@ -9,6 +9,7 @@ from catacaustics.geometry import hull_mesh
 from catacaustics.reflectors.fit import fit_ellipsoid, fit_plane, fit_sphere, surroundings
 from catacaustics.reflectors.volume import ReflectionVolume
 from catacaustics.reflectors.warps import (
+    MovedWarp,
     NeuralWarp,
     PlaneWarp,
     QuadricNeuralWarp,
@@ -195,3 +196,20 @@ def test_surroundings_are_spread_evenly_and_show_the_nearest_known_point():
     np.testing.assert_allclose(distance[top], 10.0, rtol=1e-3)
     np.testing.assert_allclose(found[top], 0.2)
     assert abs((positions[:, 0] > 0).mean() - 0.5) < 0.02
+
+
+def test_a_reflector_moved_with_its_surroundings_shows_the_moved_image():
+    """For the camera that moved along, the picture is the old one, moved."""
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=torch.Generator().manual_seed(1)))[0]
+    turn = turn * torch.sign(torch.linalg.det(turn))
+    scale, shift = 1.7, torch.tensor([0.4, -2.0, 1.1])
+    points, camera = torch.randn(30, 3) * 2, torch.tensor([3.0, 0.5, 0.2])
+    for warp in every_warp():
+        with torch.no_grad():
+            old, new = warp(points, camera), MovedWarp(warp, scale, turn, shift)(points, scale * turn @ camera + shift)
+        seen = torch.ones(len(points), dtype=torch.bool) if old.visible is None else old.visible
+        expected = scale * old.positions @ turn.T + shift
+        torch.testing.assert_close(new.positions[seen], expected[seen], rtol=1e-3, atol=2e-3)
+        again = warp_from_state(MovedWarp(warp, scale, turn, shift).state_dict())
+        assert isinstance(again, MovedWarp)
+        assert type(again.warp) is type(warp)

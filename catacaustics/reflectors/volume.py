@@ -100,6 +100,14 @@ class ReflectionVolume:
         planes[:, 3] = factor * (planes[:, 3] + offset) - offset
         return ReflectionVolume(self.name, planes, self.center + factor * (self.vertices - self.center), self.faces)
 
+    def moved(
+        self, scale: float, rotation: Float[np.ndarray, "3 3"], shift: Float[np.ndarray, "3"], name: str
+    ) -> "ReflectionVolume":
+        """At x_new = scale * rotation x + shift, under another name."""
+        normals = self.halfspaces[:, :3] @ rotation.T
+        planes = np.c_[normals, scale * self.halfspaces[:, 3] - normals @ shift]
+        return ReflectionVolume(name, planes, scale * self.vertices @ rotation.T + shift, self.faces)
+
     def sample_surface(
         self, n: int, rng: np.random.Generator
     ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:

@@ -170,7 +170,7 @@ class MovedWarp(nn.Module):
 
 def learns_positions(warp: nn.Module) -> bool:
     """Whether a cloud's points move in training: the network alone displaces points that stay fixed (paper 4.2)."""
-    return not isinstance(warp, NeuralWarp)
+    return learns_positions(warp.warp) if isinstance(warp, MovedWarp) else not isinstance(warp, NeuralWarp)
 
 
 def warp_from_state(state: dict[str, Tensor]) -> nn.Module:
