@@ -66,10 +66,10 @@ def mask(config: MaskConfig) -> None:
             ws="none",
             timeout_graceful_shutdown=2,
         )
-        try:
+        # uvicorn ends by itself, and passes the interrupt on where this process does not ignore it.
+        with suppress(KeyboardInterrupt):
             uvicorn.Server(settings).run(sockets=[listener])
-        except KeyboardInterrupt:
-            print(f"\nStopped. The masks are in {capture.root / 'masks'}")
+        print(f"\nStopped. The masks are in {capture.root / 'masks'}")
 
 
 def has_screen() -> bool:
