@@ -17,7 +17,8 @@ _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; margin: 2rem auto; max-width: 70rem; padding: 0 1rem; color: #222 }
 table { border-collapse: collapse; width: 100% } th { text-align: left; font-weight: 600 }
 td, th { padding: .3rem .6rem; border-bottom: 1px solid #ddd; vertical-align: middle }
-td.n { text-align: right; white-space: nowrap; font-variant-numeric: tabular-nums } img { display: block; border-radius: 3px }
+td.n, small { white-space: nowrap } td.n { text-align: right; font-variant-numeric: tabular-nums }
+img { display: block; border-radius: 3px }
 .confirmed { color: #18794e } .weak { color: #946800 } .out { color: #b42318 } small { color: #666 }
 svg { width: 100%; max-width: 46rem; background: #fafafa; border: 1px solid #ddd; border-radius: 6px }
 """
@@ -113,7 +114,7 @@ def write_report(
         style = "out" if view is None else verdict
         rows.append(
             f"<tr><td>{_thumbnail(capture.image(view)) if view is not None else ''}</td>"
-            f"<td>{html.escape(name)}{' <small style="white-space: nowrap">held out</small>' if view and view.name in held_out else ''}</td>"
+            f"<td>{html.escape(name)}{' <small>held out</small>' if view and view.name in held_out else ''}</td>"
             f'<td class="{style}">{verdict}</td>'
             + "".join(f'<td class="n">{cell}</td>' for cell in cells)
             + f"<td>{html.escape(reason)}</td></tr>"
