@@ -3,7 +3,6 @@
 import math
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
@@ -359,27 +358,6 @@ def test_tensors_that_do_not_go_together_are_refused_by_name(changes, message):
 
 
 # What only native code has.
-
-
-@needs_native
-def test_looking_for_values_that_are_not_finite_costs_less_than_2_percent():
-    scene = [t.requires_grad_() for t in random_scene(100_000, 8, dtype=torch.float32, size=0.005)]
-    camera, cpu = front_camera(600, 400, 600.0), find_library("cpu").library
-    values = torch.cat([t.detach().flatten() for t in scene])
-
-    def seconds(function):
-        times = []
-        for _ in range(5):
-            start = time.perf_counter()
-            function()
-            times.append(time.perf_counter() - start)
-        return min(times)
-
-    def step():
-        out = splat_points(*scene, camera, backend="cpu")
-        (out.image.sum() + out.transmittance.sum()).backward()
-
-    assert seconds(lambda: cpu.call("finite", values, values, len(values))) < 0.02 * seconds(step)
 
 
 @needs_native

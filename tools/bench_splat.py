@@ -128,6 +128,12 @@ def speed(options: argparse.Namespace) -> list[dict]:
             )
             figures = {"forward": forward, "backward": backward, "yardstick": yardstick, "pairs": pairs}
             results.append({"size": size, "count": count, "backend": backend} | figures)
+        library = find_library("cpu").library
+        if library is not None:
+            flat = torch.cat([t.detach().flatten() for t in scene])
+            check = medians([(seconds(lambda v=flat: library.call("finite", v, v, len(v))),) for _ in range(9)])[0]
+            print(f"{size:>5} looking for values that are not finite: {100 * check / total['cpu']:.2f} % of a step")
+            results.append({"size": size, "count": count, "backend": "cpu", "finite": check})
         if len(total) == 2:
             print(f"{size:>5} cpu is {total['reference'] / total['cpu']:.1f} times as fast as the reference")
     return results
