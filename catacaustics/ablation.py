@@ -16,13 +16,13 @@ from catacaustics.catacaustic import flow_error
 from catacaustics.config import AblateConfig, TrainConfig
 from catacaustics.errors import UserError
 from catacaustics.files import read_json, write_json, write_text
-from catacaustics.images import resize
 from catacaustics.metrics import psnr
+from catacaustics.page import html_page
 from catacaustics.reflectors.volume import ReflectionVolume, build_volume
 from catacaustics.scene import Scene
 from catacaustics.training.initialize import named_reflectors, usual_points
 from catacaustics.training.loop import device_of, fit
-from catacaustics.training.photographs import scaled_camera
+from catacaustics.training.photographs import photograph, scaled_camera
 from catacaustics.training.selection import choose_models
 
 _ROWS: dict[str, dict[str, Any]] = {
@@ -34,8 +34,8 @@ _ROWS: dict[str, dict[str, Any]] = {
     "full (neural)": {"model": ("neural",)},
 }
 _RUNGS = ("static", "plane", "sphere", "ellipsoid", "concave", "quadric+neural")
-_CLOUDS = (0.25, 0.5, 1.0)
-"""Sizes of the reflection clouds in the chart, in units of the usual number."""
+_CLOUDS = (0.25, 0.5)
+"""Sizes of the reflection clouds in the chart beside the usual one, in its units."""
 
 
 def ablate(config: AblateConfig) -> dict[str, Any]:
@@ -89,7 +89,7 @@ def _rows(config: AblateConfig, capture: Capture, volumes: list[ReflectionVolume
     rows = {k: dict(v) for k, v in _ROWS.items()} | {r: {"model": (r,)} for r in _RUNGS}
     rows["half warp"]["warp_width"] = train.warp_width // 2
     for rung in config.cloud_rungs:
-        for share in _CLOUDS[:-1]:
+        for share in _CLOUDS:
             name = f"{rung}, {share:g} x points"
             rows[name] = {"model": (rung,), "reflection_points": max(200, int(share * usual))}
     unknown = [r for r in config.rows if r not in rows]
@@ -134,7 +134,7 @@ def held_out_scores(
         camera = scaled_camera(view.camera, config.image_size, 1.0)
         with torch.no_grad():
             render = scene.render(camera).rgb.cpu().numpy()
-        photo = resize(capture.image(view), camera.width, camera.height).astype(np.float32) / 255
+        photo = photograph(capture, view, camera)
         mask = np.logical_or.reduce([v.project_mask(camera) for v in volumes])
         whole.append(psnr(render, photo))
         if mask.any():
@@ -217,22 +217,15 @@ def _page(capture: Capture, config: AblateConfig, results: list[dict[str, Any]])
             f"</thead><tbody>{body}</tbody></table></div></section>"
         )
     name = escape(f"{Path(config.capture).absolute().name}: ablation")
-    style = Path(__file__).with_name("report.css").read_text()
     facts = (
         f"{len(capture.held_out)} held-out views at up to {config.image_size} pixels, projected reflection volumes; "
         f"device {device_of(TrainConfig(config.capture, config.out, device=config.device))}. Flicker: mean absolute "
         "difference between the changes of renders and photographs from view to view. Flow: mean angle between "
         "displayed and true directions of mirrored things."
     )
-    return (
-        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{name}</title>'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f'<meta name="color-scheme" content="light dark"><style>\n{style}</style></head>\n<body><main>'
-        f'<header><p class="facts">Ablation</p><h1>{name}</h1><p class="hint">{facts}</p></header>'
-        f'<section><h2>Error against seconds</h2><figure class="curve">{chart(results)}</figure></section>'
-        + "".join(tables)
-        + "</main></body></html>\n"
-    )
+    header = f'<header><p class="facts">Ablation</p><h1>{name}</h1><p class="hint">{facts}</p></header>'
+    curves = f'<section><h2>Error against seconds</h2><figure class="curve">{chart(results)}</figure></section>'
+    return html_page(name, header + curves + "".join(tables))
 
 
 def chart(results: list[dict[str, Any]]) -> str:

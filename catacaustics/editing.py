@@ -8,6 +8,7 @@ import torch
 from torch import nn
 
 from catacaustics.config import CloneConfig, EditConfig
+from catacaustics.environment import texels
 from catacaustics.errors import UserError
 from catacaustics.files import write_json
 from catacaustics.images import read_image
@@ -102,13 +103,10 @@ def replace_surroundings(scene: Scene, index: int, panorama: Float[np.ndarray, "
     cloud: PointParameters = edited.reflections[index]  # pyright: ignore[reportAssignmentType]
     with torch.no_grad():
         center = torch.from_numpy(scene.volumes[index].center).to(cloud.positions)
-        x, y, z = torch.nn.functional.normalize(cloud.positions - center, dim=1).unbind(1)
-        height, width = panorama.shape[:2]
-        column = ((torch.atan2(x, z) / np.pi + 1) / 2 * width).long().clamp(0, width - 1)
-        row = ((torch.asin(y.clamp(-1, 1)) / (np.pi / 2) + 1) / 2 * height).long().clamp(0, height - 1)
+        directions = torch.nn.functional.normalize(cloud.positions - center, dim=1)
         colors = torch.from_numpy(np.ascontiguousarray(panorama, np.float32)).to(scene.device)
         cloud.features.zero_()
-        cloud.features[:, :3] = colors[row, column]
+        cloud.features[:, :3] = colors[texels(directions, *panorama.shape[:2])]
     return edited
 
 

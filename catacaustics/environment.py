@@ -6,7 +6,15 @@ import torch
 from torch import Tensor, nn
 
 from catacaustics.renderer import FEATURES
-from catacaustics.shapes import Float
+from catacaustics.shapes import Float, Int
+
+
+def texels(directions: Float[Tensor, "n 3"], height: int, width: int) -> tuple[Int[Tensor, "n"], Int[Tensor, "n"]]:
+    """Rows and columns of a latitude-longitude image that unit directions fall on; the poles are the y axis."""
+    x, y, z = directions.unbind(-1)
+    column = ((torch.atan2(x, z) / math.pi + 1) / 2 * width).long().clamp(0, width - 1)
+    row = ((torch.asin(y.clamp(-1, 1)) / (math.pi / 2) + 1) / 2 * height).long().clamp(0, height - 1)
+    return row, column
 
 
 class EnvironmentMap(nn.Module):
@@ -22,9 +30,7 @@ class EnvironmentMap(nn.Module):
         """Set the colours (the first three features) to weighted means of what was seen; texels that saw little take
         them from coarser levels (push-pull, Gortler et al. 1996)."""
         _, height, width = self.features.shape
-        x, y, z = directions.unbind(-1)
-        column = ((torch.atan2(x, z) / math.pi + 1) / 2 * width).long().clamp(0, width - 1)
-        row = ((torch.asin(y.clamp(-1, 1)) / (math.pi / 2) + 1) / 2 * height).long().clamp(0, height - 1)
+        row, column = texels(directions, height, width)
         sums = colors.new_zeros(4, height * width)
         sums.index_add_(1, row * width + column, torch.cat([colors * weights[:, None], weights[:, None]], 1).T)
         levels = [sums.view(1, 4, height, width)]

@@ -24,7 +24,7 @@ from catacaustics.scene import RenderOutput, Scene
 from catacaustics.shapes import Bool
 from catacaustics.training.corrections import align_view
 from catacaustics.training.initialize import scene_extent
-from catacaustics.training.photographs import scaled_camera
+from catacaustics.training.photographs import photograph, scaled_camera
 
 _ALIGNED = (
     "the view's own pose correction and three exposure gains, where training learned those of its photographs, fitted "
@@ -128,7 +128,7 @@ def _measure(
             "a trained scene",
             "train again from an earlier checkpoint or with lower learning rates",
         )
-    photo = resize(run.capture.image(view), camera.width, camera.height).astype(np.float32) / 255
+    photo = photograph(run.capture, view, camera)
     mask, source = reflector_mask(volumes, run.capture, view, camera)
     comparison = compare(render, photo, mask)
     row = {

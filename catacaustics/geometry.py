@@ -27,6 +27,13 @@ def normalize(vectors: Float[np.ndarray, "*batch d"]) -> Float[np.ndarray, "*bat
     return vectors / np.where(length > 0, length, 1)
 
 
+def sphere_directions(count: int) -> Float[np.ndarray, "n 3"]:
+    """Unit vectors spread evenly over the sphere: a spiral by the golden angle, from +z to -z."""
+    turn = np.arange(count) + 0.5
+    polar, azimuth = np.arccos(1 - 2 * turn / count), np.pi * (1 + 5**0.5) * turn
+    return np.stack([np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)], -1)
+
+
 def rigid(rotation: Float[np.ndarray, "3 3"], translation: Float[np.ndarray, "3"]) -> Float[np.ndarray, "4 4"]:
     """The 4x4 matrix of x -> rotation @ x + translation."""
     matrix = np.eye(4)

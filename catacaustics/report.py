@@ -15,6 +15,7 @@ import numpy as np
 
 from catacaustics.images import encode_image, resize
 from catacaustics.layers import DEPTH_COLORMAP, ERROR_COLORMAP, colorize, depth_range, error_image, layer_image
+from catacaustics.page import html_page
 from catacaustics.scene import RenderOutput
 from catacaustics.shapes import Bool, Float
 
@@ -135,14 +136,9 @@ def report_html(
         f"<section><h2>Training</h2>{_curves(log, skipped)}</section>",
         f"<section><h2>Details</h2>{''.join(details)}</section>",
     ]
-    style, script = (Path(__file__).with_name(f"report.{kind}").read_text() for kind in ("css", "js"))
-    return (
-        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{name}: held-out evaluation</title>'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f'<meta name="color-scheme" content="light dark"><style>\n{style}</style></head>\n<body><main>'
-        + "\n".join(sections)
-        + f"</main>\n{_DIALOG}\n<script>\n{script}</script></body></html>\n"
-    )
+    script = Path(__file__).with_name("report.js").read_text()
+    after = f"\n{_DIALOG}\n<script>\n{script}</script>"
+    return html_page(f"{name}: held-out evaluation", "\n".join(sections), after=after)
 
 
 def _picture(caption: str, image: np.ndarray) -> Picture:

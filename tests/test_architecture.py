@@ -31,6 +31,7 @@ FLOORS = [
     "metrics",
     "run",
     "layers",
+    "page",
     "training",
     "report",
     "evaluation",

@@ -19,7 +19,7 @@ from catacaustics.reflectors.volume import build_volume
 from catacaustics.run import open_run
 from catacaustics.scene import Scene
 from catacaustics.training.initialize import Reflector, initial_scene, primary_seeds, reflection_seeds
-from catacaustics.web.viewer import Viewer, _quaternion, shifted_camera, window_camera
+from catacaustics.web.viewer import Viewer, _quaternion, window_camera
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
@@ -50,7 +50,7 @@ def test_a_window_that_stands_where_a_photograph_was_taken_has_its_camera(captur
 
 def test_a_shifted_camera_moves_along_its_own_axes(capture):
     camera = capture.views[0].camera
-    moved = shifted_camera(camera, np.array([0.1, 0.2, 0.3]))
+    moved = camera.displaced(np.array([0.1, 0.2, 0.3]))
     local = camera.camera_from_world[:3, :3] @ (moved.center - camera.center)
     np.testing.assert_allclose(local, [0.1, 0.2, 0.3])
     assert np.array_equal(moved.camera_from_world[:3, :3], camera.camera_from_world[:3, :3])

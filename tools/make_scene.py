@@ -27,6 +27,7 @@ from catacaustics.capture.dataset import View, write_capture
 from catacaustics.capture.truth import write_truth
 from catacaustics.errors import UserError
 from catacaustics.files import read_json, write_bytes, write_json
+from catacaustics.geometry import sphere_directions
 from catacaustics.images import write_image
 
 CLEARANCE = 0.15
@@ -66,9 +67,7 @@ class MakeScene:
 
 def camera_problem(renderer: Renderer, camera: Camera) -> str | None:
     """What is wrong with where a camera stands: inside or close to a thing, or no clear view of a reflector."""
-    turn = np.arange(400) + 0.5
-    polar, azimuth = np.arccos(1 - 2 * turn / 400), np.pi * (1 + 5**0.5) * turn
-    sphere = np.stack([np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)], -1)
+    sphere = sphere_directions(400)
     around = renderer.trace(np.broadcast_to(camera.center, sphere.shape), sphere)
     if around.back[around.reflector < 0].mean() > 0.5:  # a few back faces are seen inside lampshades and cups
         return "is inside an object"

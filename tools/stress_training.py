@@ -25,7 +25,7 @@ from catacaustics.scene import Scene
 from catacaustics.training.corrections import align_view
 from catacaustics.training.initialize import named_reflectors, scene_extent
 from catacaustics.training.loop import fit
-from catacaustics.training.photographs import scaled_camera
+from catacaustics.training.photographs import photograph, scaled_camera
 
 
 @dataclass(frozen=True)
@@ -77,13 +77,12 @@ def score(scene: Scene, capture: Capture, volume: ReflectionVolume, image_size: 
     """Mean PSNR inside the true volume on the held-out views."""
     import torch
 
-    from catacaustics.images import resize
     from catacaustics.metrics import psnr
 
     values = []
     for view in capture.held_out:
         camera = scaled_camera(view.camera, image_size, 1.0)
-        photo = resize(capture.image(view), camera.width, camera.height).astype(np.float32) / 255
+        photo = photograph(capture, view, camera)
         if align:
             aligned = align_view(scene, camera, torch.from_numpy(photo), True, False, scene_extent(capture))
             image = aligned.render(scene, camera).numpy()

@@ -6,7 +6,7 @@ not to the volume's corners, which lie outside the reflector.
 
 import numpy as np
 
-from catacaustics.geometry import normalize
+from catacaustics.geometry import normalize, sphere_directions
 from catacaustics.reflectors.volume import ReflectionVolume
 from catacaustics.shapes import Float
 
@@ -80,9 +80,7 @@ def surroundings(
     """
     from scipy.spatial import cKDTree
 
-    turn = np.arange(count) + 0.5
-    polar, azimuth = np.arccos(1 - 2 * turn / count), np.pi * (1 + 5**0.5) * turn
-    directions = np.stack([np.cos(azimuth) * np.sin(polar), np.sin(azimuth) * np.sin(polar), np.cos(polar)], -1)
+    directions = sphere_directions(count)
     offsets = points - volume.center
     distances = np.linalg.norm(offsets, axis=1)
     outside = distances > 1.02 * volume.radius

@@ -28,6 +28,14 @@ class Displayed(NamedTuple):
     start: Float[Tensor, "n 3"] | None = None
 
 
+def rotation_matrix(vector: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
+    """The rotation about a vector by its length in radians, differentiable at zero too."""
+    x, y, z = vector.unbind()
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3)
+    return torch.linalg.matrix_exp(cross)
+
+
 class StaticWarp(nn.Module):
     """p' = p: painted-on highlights, and flat mirrors, whose image does not move with the camera."""
 
@@ -89,10 +97,7 @@ class QuadricWarp(nn.Module):
         center = self.start_center + self.shift * self.start_axes.norm(dim=0).mean()
         axes = self.start_axes * self.log_radii.exp()
         if self.turn is not None:
-            x, y, z = self.turn.unbind()
-            zero = torch.zeros_like(x)
-            cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3)
-            axes = torch.linalg.matrix_exp(cross) @ axes
+            axes = rotation_matrix(self.turn) @ axes
         return center, axes
 
     def forward(self, points: Points, center: Float[Tensor, "3"], start: Points | None = None) -> Displayed:

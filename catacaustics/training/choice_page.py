@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from catacaustics.page import html_page
+
 _TITLES = {
     "model": ("What are the reflectors?", "PSNR inside the reflector"),
     "environment": ("Does the scene need an environment map?", "PSNR of the whole image"),
@@ -46,20 +48,17 @@ def choice_html(folder: Path, result: dict[str, Any], least_gain: float) -> str:
         for i, taken in enumerate(result["taken"].get(question, [])):
             heading = f"{title} {escape(reflectors[i])}" if question == "model" and len(reflectors) > 1 else title
             sections.append(f"<section><h2>{heading}</h2>{_table(rows, question, i, measure, taken)}</section>")
-    style = Path(__file__).parents[1].joinpath("report.css").read_text()
     bars = (
         ".bars td, .bars th { padding: .35rem 1rem; text-align: right; } .bars th:first-child { text-align: left; }"
         ".bars td.track { width: 22rem; text-align: left; } .bars tbody tr { border-top: 1px solid var(--line); }"
         ".track i { display: block; height: .8rem; border-radius: 3px; background: var(--accent); opacity: .55; }"
         ".taken { font-weight: 600; } .taken .track i { opacity: 1; }"
     )
-    return (
-        f'<!doctype html>\n<html lang="en"><head><meta charset="utf-8"><title>{name}: model choice</title>'
-        '<meta name="viewport" content="width=device-width, initial-scale=1">'
-        f'<meta name="color-scheme" content="light dark"><style>\n{style}{bars}</style></head>\n<body><main>'
+    header = (
         f'<header><p class="facts">Model choice</p><h1>{name}</h1><p>{models}{"; " + rest if rest else ""}</p>'
-        f'<p class="hint">{rule}</p></header>' + "\n".join(sections) + "</main></body></html>\n"
+        f'<p class="hint">{rule}</p></header>'
     )
+    return html_page(f"{name}: model choice", header + "\n".join(sections), bars)
 
 
 def _table(rows: Sequence[dict[str, Any]], question: str, reflector: int, measure: str, taken: str) -> str:

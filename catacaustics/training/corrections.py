@@ -4,14 +4,13 @@ A pose correction moves the world by x -> c + R (x - c) + t in front of the came
 the same picture as the corrected camera takes of the resting world. Gains multiply the decoded colours.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from catacaustics.cameras import Camera
 from catacaustics.losses import dssim
+from catacaustics.reflectors.warps import rotation_matrix
 from catacaustics.scene import Motion, Scene, frozen
 from catacaustics.shapes import Float
 
@@ -35,14 +34,17 @@ class Corrections(nn.Module):
         """The correction of a photograph's pose, for Scene.layers."""
         if self.poses is None:
             return None
-        x, y, z = self.poses[index, :3].unbind()
-        zero = torch.zeros_like(x)
-        cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).view(3, 3)
-        return Motion(torch.linalg.matrix_exp(cross), self.poses[index, 3:] * self.extent)
+        return Motion(rotation_matrix(self.poses[index, :3]), self.poses[index, 3:] * self.extent)
 
     def expose(self, index: int, image: Float[Tensor, "height width 3"]) -> Float[Tensor, "height width 3"]:
         """An image as the photograph's camera would have exposed it."""
         return image if self.log_gains is None else image * self.log_gains[index].exp()
+
+    def render(self, scene: Scene, camera: Camera, index: int = 0) -> Float[Tensor, "height width 3"]:
+        """RGB in [0, 1] as a photograph's corrected camera takes it."""
+        with torch.no_grad():
+            image = scene.decode(scene.layers(camera, motion=self.motion(index)))
+            return self.expose(index, image).clamp(0, 1)
 
     def summary(self, names: list[str]) -> list[dict[str, object]]:
         """Rotation in degrees, shift in world units and gains by photograph, for JSON."""
@@ -57,18 +59,6 @@ class Corrections(nn.Module):
         return rows
 
 
-class Alignment(NamedTuple):
-    """A held-out view's own corrections, fitted with the scene frozen."""
-
-    corrections: Corrections
-
-    def render(self, scene: Scene, camera: Camera) -> Float[Tensor, "height width 3"]:
-        """RGB in [0, 1] with the corrections."""
-        with torch.no_grad():
-            image = scene.decode(scene.layers(camera, motion=self.corrections.motion(0)))
-            return self.corrections.expose(0, image).clamp(0, 1)
-
-
 def align_view(
     scene: Scene,
     camera: Camera,
@@ -77,7 +67,7 @@ def align_view(
     exposure: bool,
     extent: float,
     steps: int = 40,
-) -> Alignment:
+) -> Corrections:
     """Fit pose and gains of one view to its photograph, with the scene frozen: a held-out view is measured with and
     without, because corrections of the training views leave the others where they were calibrated.
 
@@ -87,7 +77,7 @@ def align_view(
     """
     corrections = Corrections(1, poses, exposure, extent).to(scene.device)
     if not list(corrections.parameters()):
-        return Alignment(corrections)
+        return corrections
     with frozen(scene):
         groups = [{"params": [p], "lr": rate} for p, rate in zip(corrections.parameters(), _rates(poses), strict=False)]
         optimizer = torch.optim.Adam(groups)
@@ -99,7 +89,7 @@ def align_view(
             loss.backward()
             optimizer.step()
             schedule.step()
-    return Alignment(corrections)
+    return corrections
 
 
 def _rates(poses: bool) -> tuple[float, ...]:

@@ -11,7 +11,6 @@ from catacaustics.capture.dataset import Capture, View
 from catacaustics.config import SplatConfig, TrainConfig
 from catacaustics.environment import EnvironmentMap
 from catacaustics.errors import UserError
-from catacaustics.images import resize
 from catacaustics.losses import dssim
 from catacaustics.reflectors.fit import fit_ellipsoid, fit_plane, fit_sphere, surroundings
 from catacaustics.reflectors.volume import ReflectionVolume
@@ -26,7 +25,7 @@ from catacaustics.reflectors.warps import (
 from catacaustics.renderer import FEATURES, NeuralRenderer
 from catacaustics.scene import PointParameters, Scene, frozen
 from catacaustics.shapes import Float
-from catacaustics.training.photographs import scaled_camera
+from catacaustics.training.photographs import photograph, scaled_camera
 
 INITIAL_OPACITY = 0.8
 _SIZES = (1.0, 0.8, 0.65)
@@ -254,8 +253,7 @@ def seen_through(
         camera = scaled_camera(view.camera, min(size, config.image_size), 1.0)
         with torch.no_grad():
             layers = scene.layers(camera)
-        photo = resize(capture.image(view), camera.width, camera.height)
-        colors = torch.from_numpy(photo).to(scene.device).float().view(-1, 3) / 255
+        colors = torch.from_numpy(photograph(capture, view, camera)).to(scene.device).view(-1, 3)
         parts.append((layers.directions.view(-1, 3), colors, layers.transmittance.reshape(-1)))
     directions, colors, weights = (torch.cat(p) for p in zip(*parts, strict=True))
     return directions, colors, weights
@@ -286,9 +284,9 @@ def _start_shape(
     parameters = list(quadric.parameters())
     targets = []
     for view, camera, box in cameras:
-        photo = resize(capture.image(view), camera.width, camera.height)
+        photo = photograph(capture, view, camera)
         photo = photo[box.y0 : box.y0 + box.height, box.x0 : box.x0 + box.width]
-        targets.append(torch.from_numpy(np.ascontiguousarray(photo)).to(scene.device).float() / 255)
+        targets.append(torch.from_numpy(np.ascontiguousarray(photo)).to(scene.device))
 
     def error(i: int) -> torch.Tensor:
         image = scene.decode(scene.layers(cameras[i][1], cameras[i][2]))

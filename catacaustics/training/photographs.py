@@ -8,13 +8,18 @@ from catacaustics.cameras import Camera, Viewport
 from catacaustics.capture.dataset import Capture, View
 from catacaustics.images import resize
 from catacaustics.reflectors.volume import ReflectionVolume
-from catacaustics.shapes import UInt8
+from catacaustics.shapes import Float, UInt8
 
 
 def scaled_camera(camera: Camera, image_size: int, scale: float) -> Camera:
     """The camera at `scale` times the training size: its longer side reduced to `image_size` where it is larger."""
     factor = scale * min(1.0, image_size / max(camera.width, camera.height))
     return camera.resized(max(1, round(camera.width * factor)), max(1, round(camera.height * factor)))
+
+
+def photograph(capture: Capture, view: View, camera: Camera) -> Float[np.ndarray, "height width 3"]:
+    """A view's photograph in [0, 1] at a camera's size."""
+    return resize(capture.image(view), camera.width, camera.height).astype(np.float32) / 255
 
 
 class PhotographCache:

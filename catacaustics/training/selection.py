@@ -14,10 +14,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from catacaustics.capture.dataset import Capture, View
+from catacaustics.capture.dataset import Capture
 from catacaustics.config import TrainConfig
 from catacaustics.files import read_json, write_json, write_text
-from catacaustics.images import resize
 from catacaustics.metrics import psnr
 from catacaustics.reflectors.volume import ReflectionVolume
 from catacaustics.scene import Scene
@@ -25,7 +24,7 @@ from catacaustics.training.choice_page import choice_html
 from catacaustics.training.corrections import align_view
 from catacaustics.training.initialize import named_reflectors, scene_extent, usual_points
 from catacaustics.training.loop import fit
-from catacaustics.training.photographs import scaled_camera
+from catacaustics.training.photographs import photograph, scaled_camera
 
 LADDER = ("none", "static", "plane", "sphere", "ellipsoid", "concave", "neural", "quadric+neural")
 """Rungs from the simplest to the most complex."""
@@ -238,7 +237,7 @@ class _Trials:
         whole = []
         for view in self.validation:
             camera = scaled_camera(view.camera, self.config.image_size, 1.0)
-            photo = self._photograph(view, camera.width, camera.height)
+            photo = photograph(self.capture, view, camera)
             if question == "photographs":
                 target, extent = torch.from_numpy(photo).to(scene.device), scene_extent(self.capture)
                 image = align_view(scene, camera, target, True, True, extent).render(scene, camera).cpu().numpy()
@@ -254,9 +253,6 @@ class _Trials:
         )
         steps = len((folder / "metrics.jsonl").read_text().splitlines()) * 10
         return Trial(name, question, _plain(settings), seconds, steps, points, parameters, inside, whole)
-
-    def _photograph(self, view: View, width: int, height: int) -> np.ndarray:
-        return resize(self.capture.image(view), width, height).astype(np.float32) / 255
 
 
 def _plain(settings: dict) -> dict:

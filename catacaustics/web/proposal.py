@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from catacaustics.cameras import Camera
-from catacaustics.geometry import normalize
+from catacaustics.geometry import normalize, sphere_directions
 from catacaustics.shapes import Float
 
 
@@ -40,17 +40,10 @@ def propose_views(
     if len(candidates) <= count:
         return sorted(candidates.tolist())
     lines = normalize(np.array([cameras[i].center for i in candidates]) - target)
-    sines = np.sqrt(np.maximum(1 - (lines @ _directions().T) ** 2, 0.02))
+    sines = np.sqrt(np.maximum(1 - (lines @ sphere_directions(600).T) ** 2, 0.02))
     reach = sines**-3.0  # its cube is the volume by solid angle
     chosen = _exchange(reach, count, len(fixed))
     return sorted(candidates[chosen].tolist())
-
-
-def _directions(n: int = 600) -> Float[np.ndarray, "n 3"]:
-    """Directions spread evenly over the sphere (a spiral of golden angles)."""
-    z = 1 - (2 * np.arange(n) + 1) / n
-    angle = np.arange(n) * np.pi * (3 - np.sqrt(5))
-    return np.stack([np.sqrt(1 - z**2) * np.cos(angle), np.sqrt(1 - z**2) * np.sin(angle), z], -1)
 
 
 def _exchange(reach: Float[np.ndarray, "views directions"], count: int, fixed: int) -> list[int]:

@@ -8,7 +8,6 @@ import threading
 import time
 import webbrowser
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, get_args
 
@@ -88,13 +87,6 @@ def window_camera(
     return Camera(width, height, float(focal), float(focal), width / 2, height / 2, pose)
 
 
-def shifted_camera(camera: Camera, offset: Float[np.ndarray, "3"]) -> Camera:
-    """The camera moved by an offset along its own axes (right, down, forward)."""
-    pose = camera.camera_from_world.copy()
-    pose[:3, 3] -= offset
-    return replace(camera, camera_from_world=pose)
-
-
 class Viewer:
     """The viewer's controls and one `_Window` for each browser that looks.
 
@@ -138,7 +130,7 @@ class Viewer:
         if self.warp.value == _FROZEN:
             return self.frozen
         if self.warp.value == _SHIFTED:
-            return shifted_camera(camera, np.array(self.offset.value, float) * self.reach)
+            return camera.displaced(np.array(self.offset.value, float) * self.reach)
         return None
 
     def render(self, camera: Camera) -> RenderOutput:
