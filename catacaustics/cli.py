@@ -18,20 +18,24 @@ _COMMANDS = {
     "render": ("catacaustics.video", "render_video", "RenderConfig"),
     "edit": ("catacaustics.editing", "edit", "EditConfig"),
     "clone": ("catacaustics.editing", "clone", "CloneConfig"),
+    "refract data": ("catacaustics.refraction.data", "make_data", "RefractDataConfig"),
     "doctor": ("catacaustics.doctor", "doctor", "DoctorConfig"),
 }
 
 
-def _help() -> str:
+def _help(group: str = "") -> str:
+    """Help on all commands, or on those of a group ("refract")."""
     config = importlib.import_module("catacaustics.config")
     lines = [
-        "usage: catacaustics COMMAND ...",
+        f"usage: catacaustics {group} COMMAND ..." if group else "usage: catacaustics COMMAND ...",
         "",
         "Photographs of shiny objects in, scenes to look around in out.",
         "",
     ]
     for command, (_, _, name) in _COMMANDS.items():
-        lines.append(f"  {command:<12} {getattr(config, name).__doc__.splitlines()[0]}")
+        if group and command.split()[0] != group:
+            continue
+        lines.append(f"  {command:<17} {getattr(config, name).__doc__.splitlines()[0]}")
     return "\n".join([*lines, "", "`catacaustics COMMAND --help` lists a command's options."])
 
 
@@ -44,9 +48,15 @@ def main(arguments: list[str] | None = None) -> int:
     if arguments[0] == "--version":
         print(importlib.import_module("catacaustics").__version__)
         return 0
-    command = arguments[0]
+    groups = {c.split()[0] for c in _COMMANDS if " " in c}
+    group = arguments[0] if arguments[0] in groups else ""
+    if group and (len(arguments) == 1 or arguments[1] in ("-h", "--help", "help")):
+        print(_help(group))
+        return 0
+    words = 2 if group else 1
+    command = " ".join(arguments[:words])
     if command not in _COMMANDS:
-        print(f"catacaustics: there is no command '{command}'\n\n{_help()}", file=sys.stderr)
+        print(f"catacaustics: there is no command '{command}'\n\n{_help(group)}", file=sys.stderr)
         return 2
     import tyro
 
@@ -55,14 +65,16 @@ def main(arguments: list[str] | None = None) -> int:
     for field in [f for f in config_type.__annotations__ if f.endswith("_")]:  # import_: the name is a Python keyword
         kind = config_type.__annotations__[field]
         config_type.__annotations__[field] = Annotated[kind, tyro.conf.arg(name=field.removesuffix("_"))]
-    config = tyro.cli(tyro.conf.PositionalRequiredArgs[config_type], prog=f"catacaustics {command}", args=arguments[1:])
+    config = tyro.cli(
+        tyro.conf.PositionalRequiredArgs[config_type], prog=f"catacaustics {command}", args=arguments[words:]
+    )
     try:
         getattr(importlib.import_module(module), function)(config)
     except UserError as error:
-        print(f"catacaustics {command}: {error}", file=sys.stderr)
+        print(f"{prog}: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print(f"catacaustics {command}: interrupted; finished work is kept", file=sys.stderr)
+        print(f"{prog}: interrupted; finished work is kept", file=sys.stderr)
         return 130
     return 0
 

@@ -317,5 +317,33 @@ class ViewConfig:
 
 
 @dataclass(frozen=True)
+class RefractDataConfig:
+    """Make a data set for refraction baking: views of a glass scene with G-buffers, R-buffers and references."""
+
+    scene: str
+    """cornell, hemisphere, checker or tir."""
+    out: Path
+    """Folder to write; finished shards found there are kept."""
+    train: int = 240
+    """Frames to train on, with path-traced references."""
+    val: int = 24
+    test: int = 36
+    generator: int = 600
+    """More frames to train the R-buffer generator on, without references; they cost little."""
+    resolution: int = 128
+    """Side of the square images in pixels."""
+    screen: int = 1024
+    """Side of the screen-space colour buffer in pixels."""
+    spp: int = 128
+    """Samples a pixel of the references."""
+    ranges: tuple[str, ...] = ()
+    """Ranges other than the scene's own, as NAME=LOW:HIGH or NAME=VALUE; the card lists names and ranges."""
+    seed: int = 0
+    processes: int = 2
+    variant: Literal["auto", "cuda_ad_rgb", "llvm_ad_rgb"] = "auto"
+    """Mitsuba variant; auto takes CUDA where it works."""
+
+
+@dataclass(frozen=True)
 class DoctorConfig:
     """What is installed, what it can do here, and what would make it faster."""

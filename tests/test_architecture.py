@@ -40,6 +40,7 @@ FLOORS = [
     "editing",
     "video",
     "reconstruct",
+    "refraction",
     "web",
     "doctor",
     "cli",

@@ -31,7 +31,7 @@ def test_help_lists_every_command_and_each_has_its_own_help(capsys):
     for command in cli._COMMANDS:
         assert f"  {command} " in listing
         with pytest.raises(SystemExit) as stop:
-            cli.main([command, "--help"])
+            cli.main([*command.split(), "--help"])
         assert stop.value.code == 0
         assert command in capsys.readouterr().out
 
@@ -41,6 +41,15 @@ def test_an_unknown_command_is_named_and_the_known_ones_are_listed(capsys):
     message = capsys.readouterr().err
     assert "no command 'recontsruct'" in message
     assert "reconstruct" in message
+
+
+def test_a_group_of_commands_has_its_own_help_and_names_what_it_does_not_know(capsys):
+    assert cli.main(["refract"]) == 0
+    listing = capsys.readouterr().out
+    assert "refract data" in listing
+    assert "calibrate" not in listing
+    assert cli.main(["refract", "dtaa"]) == 2
+    assert "no command 'refract dtaa'" in capsys.readouterr().err
 
 
 def empty_folder(tmp_path):
