@@ -85,3 +85,38 @@ def read_json(path: Path) -> Any:
             "a complete JSON file",
             "delete the file and run the stage that writes it again",
         ) from error
+
+
+def write_tensors(path: Path, tensors: dict[str, Any], header: dict[str, Any]) -> None:
+    """Write named PyTorch tensors and a JSON header as one safetensors file, atomically."""
+    from safetensors.torch import save_file
+
+    ready = {name: value.detach().contiguous().cpu() for name, value in tensors.items()}
+    with atomic_path(path) as temporary:
+        save_file(ready, temporary, {"catacaustics": json.dumps(header)})
+
+
+def read_tensors(path: Path, what: str, command: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What `write_tensors` wrote.
+
+    Args:
+        what: what the file holds, for messages ("scene").
+        command: the command that writes it, for messages ("catacaustics train").
+
+    Raises:
+        UserError: the file is missing or cut off.
+    """
+    from safetensors import SafetensorError, safe_open
+
+    try:
+        with safe_open(path, "pt") as file:
+            header = json.loads((file.metadata() or {}).get("catacaustics", "{}"))
+            return {k: file.get_tensor(k) for k in file.keys()}, header  # noqa: SIM118 (not a dict)
+    except FileNotFoundError as error:
+        raise UserError(f"There is no {what} {path}.", f"a file made by `{command}`", "train first") from error
+    except (SafetensorError, OSError, ValueError) as error:
+        raise UserError(
+            f"{path} is not a complete {what} file: {error}.",
+            f"a safetensors file made by `{command}`",
+            "restore it, or train again with --resume: the last checkpoint is kept beside it",
+        ) from error

@@ -55,10 +55,10 @@ def weight_loss(rho: Float[Tensor, "height width"], mask: Bool[Tensor, "height w
     return (rho - mask.to(rho.dtype)).abs().mean()
 
 
-def total_variation(rho: Float[Tensor, "height width"]) -> Float[Tensor, ""]:
+def total_variation(image: Float[Tensor, "height width *channels"]) -> Float[Tensor, ""]:
     """Anisotropic total variation, mean absolute difference along both axes (0 for an image of one pixel)."""
-    total = rho.new_zeros(())
-    for difference in (rho.diff(dim=0), rho.diff(dim=1)):
+    total = image.new_zeros(())
+    for difference in (image.diff(dim=0), image.diff(dim=1)):
         if difference.numel():
             total = total + difference.abs().mean()
     return total

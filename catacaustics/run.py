@@ -5,6 +5,8 @@ import math
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import torch
+
 from catacaustics.capture.dataset import Capture, open_capture
 from catacaustics.errors import UserError
 from catacaustics.files import read_json
@@ -37,8 +39,6 @@ def open_run(folder: Path, capture: Path | None = None, device: str = "auto", un
     Raises:
         UserError: training has not finished, its config.json is missing or damaged, or the capture is gone.
     """
-    import torch
-
     folder = Path(folder)
     path = scene_file(folder, unfinished)
     if not path.is_file():
@@ -65,11 +65,19 @@ def open_run(folder: Path, capture: Path | None = None, device: str = "auto", un
             "the calibrated capture that the scene was trained on",
             "give its folder with --capture",
         )
+    return Run(folder, Scene.load(path, choose_device(device)), open_capture(root), config)
+
+
+def choose_device(name: str) -> torch.device:
+    """The device of a configuration: "cpu", "cuda", or "auto": the GPU if there is one.
+
+    Raises:
+        UserError: cuda is wanted and there is none.
+    """
     automatic = "cuda" if torch.cuda.is_available() else "cpu"
-    if device == "cuda" and automatic == "cpu":
+    if name == "cuda" and automatic == "cpu":
         raise UserError("There is no GPU that PyTorch can use.", "a CUDA device", "leave --device at auto, or take cpu")
-    scene = Scene.load(path, automatic if device == "auto" else device)
-    return Run(folder, scene, open_capture(root), config)
+    return torch.device(automatic if name == "auto" else name)
 
 
 def read_log(folder: Path) -> tuple[list[dict[str, Any]], int]:

@@ -6,8 +6,7 @@ reflection is: the paper does so everywhere, but a volume can be larger than wha
 blended with the primary cloud's transmittance. (Paper sections 4 and 5; the sense of rho is ours.)
 """
 
-import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -20,14 +19,18 @@ from catacaustics.cameras import Camera, Viewport, pixel_centers
 from catacaustics.config import SplatConfig
 from catacaustics.environment import EnvironmentMap
 from catacaustics.errors import UserError
-from catacaustics.files import atomic_path
+from catacaustics.files import read_tensors, write_tensors
 from catacaustics.reflectors.volume import ReflectionVolume
-from catacaustics.reflectors.warps import Displayed, learns_positions, warp_from_state
+from catacaustics.reflectors.warps import Displayed, learns_positions, painted, warp_from_state
 from catacaustics.renderer import FEATURES, NeuralRenderer
-from catacaustics.shapes import Float
+from catacaustics.shapes import Float, Int
 from catacaustics.splatting import SplatOutput, points_in_view, splat_points
 
 FORMAT = 1
+
+WarpCamera = Camera | Sequence[Camera | None] | None
+"""The camera that reflections follow instead of the view's own: one for all reflectors, or one for each (None: the
+view's own)."""
 
 
 class PointParameters(nn.Module):
@@ -84,6 +87,17 @@ class Motion(NamedTuple):
 
     def apply(self, points: Float[Tensor, "n 3"], center: Float[Tensor, "3"]) -> Float[Tensor, "n 3"]:
         return center + (points - center) @ self.rotation.T + self.shift
+
+
+class ReflectionDisks(NamedTuple):
+    """One reflection cloud as a view shows it: its rows that can land in the viewport, and their disks."""
+
+    rows: Int[Tensor, "n"]
+    positions: Float[Tensor, "n 3"]
+    normals: Float[Tensor, "n 3"]
+    footprints: Float[Tensor, "n"]
+    opacities: Float[Tensor, "n"]
+    features: Float[Tensor, "n 6"]
 
 
 class Layers(NamedTuple):
@@ -152,11 +166,11 @@ class Scene(nn.Module):
         self,
         camera: Camera,
         viewport: Viewport | None = None,
-        warp_camera: Camera | None = None,
+        warp_camera: WarpCamera = None,
         motion: Motion | None = None,
     ) -> Layers:
-        """Splat all clouds; differentiable. `warp_camera` decouples what is reflected from where it is seen from;
-        `motion` corrects the camera's pose, with gradients."""
+        """Splat all clouds; differentiable. `warp_camera` decouples what is reflected from where it is seen from: the
+        reflections that it sees are painted on the mirrors; `motion` corrects the camera's pose, with gradients."""
         viewport = viewport or camera.viewport
         directions = self._directions(camera, viewport)
         if motion is not None:
@@ -167,7 +181,7 @@ class Scene(nn.Module):
         primary = image[..., :FEATURES]
         if self.environment is not None:
             primary = primary + through[..., None] * self.environment(directions)
-        reflection, reflection_through = self._splat_reflections(camera, viewport, warp_camera or camera, motion)
+        reflection, reflection_through = self._splat_reflections(camera, viewport, warp_camera, motion)
         alpha = 1 - through
         depth = image[..., FEATURES + 1] / torch.where(alpha > 1e-4, alpha, torch.inf)
         return Layers(primary, reflection, rho, reflection_through, through, depth, directions, splats)
@@ -176,9 +190,7 @@ class Scene(nn.Module):
         """RGB of splatted layers, not clamped: training needs the gradient outside [0, 1] too."""
         return self.renderer(*_weighted(layers), layers.directions)
 
-    def render(
-        self, camera: Camera, viewport: Viewport | None = None, warp_camera: Camera | None = None
-    ) -> RenderOutput:
+    def render(self, camera: Camera, viewport: Viewport | None = None, warp_camera: WarpCamera = None) -> RenderOutput:
         """Render a view in [0, 1] with the layers people look at (no gradients)."""
         with torch.no_grad():
             layers = self.layers(camera, viewport, warp_camera)
@@ -230,67 +242,80 @@ class Scene(nn.Module):
     def _center(self, camera: Camera) -> Tensor:
         return torch.tensor(camera.center, dtype=self.primary.positions.dtype, device=self.device)
 
+    def reflector_order(self, camera: Camera) -> list[int]:
+        """Reflectors from near to far: nearer ones hide farther ones."""
+        distances = [float(np.linalg.norm(v.center - camera.center)) for v in self.volumes]
+        return np.argsort(distances, kind="stable").tolist()
+
     def _splat_reflections(
-        self, camera: Camera, viewport: Viewport, warp_camera: Camera, motion: Motion | None
+        self, camera: Camera, viewport: Viewport, warp_camera: WarpCamera, motion: Motion | None
     ) -> tuple[Tensor, Tensor]:
-        """All reflection clouds over each other, nearer reflectors first. Sources are round; where the warp does not
-        shape their images, disks face the camera."""
+        """All reflection clouds over each other, nearer reflectors first."""
         like = self.primary.positions
         image = like.new_zeros(viewport.height, viewport.width, FEATURES)
         through = like.new_ones(viewport.height, viewport.width)
-        center, warp_center = self._center(camera), self._center(warp_camera)
-        if motion is not None:
-            warp_center = warp_center - motion.shift @ motion.rotation  # where the corrected camera stands
-        distances = [float(np.linalg.norm(v.center - camera.center)) for v in self.volumes]
-        for i in np.argsort(distances, kind="stable"):
-            cloud, warp = self.reflections[i], self.warps[i]
-            with torch.no_grad():
-                shown = warp(cloud.positions, warp_center)
-                footprints = _stretched(cloud.log_footprints.exp(), shown)
-                near = points_in_view(shown.positions, footprints, camera, viewport, self.splatting)
-                if shown.visible is not None:
-                    near = near[shown.visible[near]]
-            # Only points that can land in the viewport are warped with gradients.
-            positions, _, log_footprints, logits, features = _rows(cloud, near)
-            shown = warp(positions, warp_center, None if shown.start is None else shown.start[near])
-            displayed, normals = shown.positions, shown.normals
-            if motion is not None:
-                displayed = motion.apply(displayed, center)
-                normals = None if normals is None else normals @ motion.rotation.detach().T
-            if normals is None:
-                normals = torch.nn.functional.normalize(center - displayed.detach(), dim=1)
-            output = splat_points(
-                displayed,
-                normals,
-                _stretched(log_footprints.exp(), shown),
-                torch.sigmoid(logits),
-                features,
-                camera,
-                viewport,
-                self.splatting,
-            )
+        for i in self.reflector_order(camera):
+            own = warp_camera if isinstance(warp_camera, Camera | None) else warp_camera[i]
+            disks = self.reflection_disks(i, camera, viewport, own, motion)
+            output = splat_points(*disks[1:], camera, viewport, self.splatting)
             image = image + through[..., None] * output.image
             through = through * output.transmittance
         return image, through
 
+    def reflection_disks(
+        self,
+        index: int,
+        camera: Camera,
+        viewport: Viewport | None = None,
+        warp_camera: Camera | None = None,
+        motion: Motion | None = None,
+    ) -> ReflectionDisks:
+        """The points of reflection cloud `index` as a view shows them, ready to splat; differentiable. Sources are
+        round; where the warp does not shape their images, disks face the camera."""
+        viewport = viewport or camera.viewport
+        cloud, warp = self.reflections[index], self.warps[index]
+        center, warp_center = self._center(camera), self._center(warp_camera or camera)
+        decoupled = warp_camera is not None and not torch.equal(center, warp_center)
+        if motion is not None:
+            warp_center = warp_center - motion.shift @ motion.rotation  # where the corrected camera stands
+
+        def show(points: Tensor, start: Tensor | None = None) -> Displayed:
+            shown = warp(points, warp_center, start)
+            return painted(shown, warp_center) if decoupled else shown
+
+        with torch.no_grad():
+            shown = show(cloud.positions)
+            footprints = _stretched(cloud.log_footprints.exp(), shown)
+            near = points_in_view(shown.positions, footprints, camera, viewport, self.splatting)
+            if shown.visible is not None:
+                near = near[shown.visible[near]]
+        # Only points that can land in the viewport are warped with gradients.
+        positions, _, log_footprints, logits, features = _rows(cloud, near)
+        shown = show(positions, None if shown.start is None else shown.start[near])
+        displayed, normals = shown.positions, shown.normals
+        if motion is not None:
+            displayed = motion.apply(displayed, center)
+            normals = None if normals is None else normals @ motion.rotation.detach().T
+        if normals is None:
+            normals = torch.nn.functional.normalize(center - displayed.detach(), dim=1)
+        footprints = _stretched(log_footprints.exp(), shown)
+        return ReflectionDisks(near, displayed, normals, footprints, torch.sigmoid(logits), features)
+
     def save(self, path: Path, extra: dict[str, Tensor] | None = None, notes: dict | None = None) -> None:
         """Write the scene, atomically, as one safetensors file; `extra` tensors and JSON `notes` travel along."""
-        from safetensors.torch import save_file
-
-        tensors = {f"scene.{k}": v.detach().contiguous().cpu() for k, v in self.state_dict().items()}
+        tensors = {f"scene.{k}": v for k, v in self.state_dict().items()}
         for i, volume in enumerate(self.volumes):
             tensors[f"volumes.{i}.halfspaces"] = torch.from_numpy(np.ascontiguousarray(volume.halfspaces))
             tensors[f"volumes.{i}.vertices"] = torch.from_numpy(np.ascontiguousarray(volume.vertices))
             tensors[f"volumes.{i}.faces"] = torch.from_numpy(np.ascontiguousarray(volume.faces))
-        tensors |= {k: v.detach().contiguous().cpu() for k, v in (extra or {}).items()}
+        tensors |= extra or {}
         header = {
             "format": FORMAT,
             "reflectors": [v.name for v in self.volumes],
             "splatting": vars(self.splatting),
             "notes": notes or {},
         }
-        with atomic_path(path) as temporary:
-            save_file(tensors, temporary, {"catacaustics": json.dumps(header)})
+        write_tensors(path, tensors, header)
 
     @staticmethod
     def load(path: Path, device: str | torch.device = "cpu") -> "Scene":
@@ -329,20 +354,7 @@ def _rows(cloud: PointParameters, index: Tensor) -> list[Tensor]:
 
 
 def _read_file(path: Path) -> tuple[dict[str, Tensor], dict]:
-    from safetensors import SafetensorError, safe_open
-
-    try:
-        with safe_open(path, "pt") as file:
-            header = json.loads((file.metadata() or {}).get("catacaustics", "{}"))
-            tensors = {k: file.get_tensor(k) for k in file.keys()}  # noqa: SIM118 (not a dict)
-    except FileNotFoundError as error:
-        raise UserError(f"There is no scene {path}.", "a file made by `catacaustics train`", "train first") from error
-    except (SafetensorError, OSError, ValueError) as error:
-        raise UserError(
-            f"{path} is not a complete scene file: {error}.",
-            "a safetensors file made by `catacaustics train`",
-            "restore it, or train again with --resume: the last checkpoint is kept beside it",
-        ) from error
+    tensors, header = read_tensors(path, "scene", "catacaustics train")
     if header.get("format") != FORMAT:
         raise UserError(
             f"{path} has scene format {header.get('format')}.", f"format {FORMAT}", "train again with this version"
