@@ -19,13 +19,36 @@ Points = Float[Tensor, "n 3"]
 
 class Displayed(NamedTuple):
     """Where points appear. `normals` None: disks face the camera; `stretch` multiplies squared radii (the footprint's
-    Jacobian, no gradients); points that are not `visible` are not drawn; `start` can be handed to the next call."""
+    Jacobian, no gradients); points that are not `visible` are not drawn; `start` can be handed to the next call;
+    `near` is the distance from the centre to the mirror along a point's ray, where the rung knows its mirror."""
 
     positions: Float[Tensor, "n 3"]
     normals: Float[Tensor, "n 3"] | None = None
     stretch: Float[Tensor, "n"] | None = None
     visible: Bool[Tensor, "n"] | None = None
     start: Float[Tensor, "n 3"] | None = None
+    near: Float[Tensor, "n"] | None = None
+
+
+_BEHIND = 1e-3
+"""Painted images keep their order in depth within this share of it."""
+
+
+def painted(shown: Displayed, center: Float[Tensor, "3"]) -> Displayed:
+    """What the camera centre sees, painted on the mirror: every point on its ray where that meets the mirror, farther
+    ones a hair behind.
+
+    Seen from the centre nothing changes. From elsewhere the reflection stays on the mirror and looks as it does from
+    the centre; images at their optical depth would leave the mirror's outline. Rungs that do not know their mirror are
+    returned as they are.
+    """
+    if shown.near is None:
+        return shown
+    rays = shown.positions - center
+    share = shown.near / rays.norm(dim=1).clamp_min(1e-12)
+    share = share + _BEHIND * (1 - share)
+    stretch = share**2 if shown.stretch is None else share**2 * shown.stretch
+    return shown._replace(positions=center + share[:, None] * rays, stretch=stretch.detach(), near=None)
 
 
 def rotation_matrix(vector: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
@@ -66,9 +89,11 @@ class PlaneWarp(nn.Module):
 
     def forward(self, points: Points, center: Float[Tensor, "3"], start: Points | None = None) -> Displayed:
         normal, distance = self.plane()
-        height = points @ normal - distance
-        visible = (height > 0) & (center @ normal > distance)
-        return Displayed(points - 2 * height[:, None] * normal, visible=visible)
+        height, own = points @ normal - distance, center @ normal - distance
+        images = points - 2 * height[:, None] * normal
+        with torch.no_grad():
+            near = own / (own + height).clamp_min(1e-12) * (images - center).norm(dim=1)
+        return Displayed(images, visible=(height > 0) & (own > 0), near=near)
 
 
 class QuadricWarp(nn.Module):
@@ -108,7 +133,7 @@ class QuadricWarp(nn.Module):
         direction = ray / near
         length = near + (points - found.points).norm(dim=1, keepdim=True)
         normals, stretch = tilted_disks(found.jacobian, -direction.detach())
-        return Displayed(center + length * direction, normals, stretch, found.visible, found.start)
+        return Displayed(center + length * direction, normals, stretch, found.visible, found.start, near.detach()[:, 0])
 
 
 class NeuralWarp(nn.Module):
@@ -152,8 +177,7 @@ class MovedWarp(nn.Module):
     """A reflector that was moved together with what it mirrors: the image is computed for the camera as the reflector
     would see it at its old place, then moved along. x_new = scale * rotation x_old + shift.
 
-    Physically right where the surroundings move too; a moved mirror in resting surroundings is a quadric of its own
-    with the old world points.
+    Physically right where the surroundings move too; `moved_mirror` is the mirror moved in resting surroundings.
     """
 
     def __init__(self, warp: nn.Module, scale: float, rotation: Float[Tensor, "3 3"], shift: Float[Tensor, "3"]):
@@ -170,18 +194,71 @@ class MovedWarp(nn.Module):
             positions=self.scale * shown.positions @ self.rotation.T + self.shift,
             normals=None if shown.normals is None else shown.normals @ self.rotation.T,
             stretch=self.scale**2 * (torch.ones_like(points[:, 0]) if shown.stretch is None else shown.stretch),
+            near=None if shown.near is None else self.scale * shown.near,
         )
+
+
+class DecoupledWarp(nn.Module):
+    """Reflections that follow another camera than the view's: for the centre c they are those that
+    w = c + strength ((gain - 1) (c - pivot) + offset) sees, painted on the mirror.
+
+    An edit without a counterpart in physics. Where w = c nothing changes, bit for bit.
+
+    Args:
+        offset: (3,) world units.
+        gain: how many times as fast as the view's camera the warp's moves.
+        pivot: (3,) where both are at the same place.
+        strength: 0 leaves reflections as they are.
+    """
+
+    def __init__(
+        self, warp: nn.Module, offset: Float[Tensor, "3"], gain: float, pivot: Float[Tensor, "3"], strength: float = 1.0
+    ):
+        super().__init__()
+        self.warp = warp
+        self.register_buffer("offset", offset)
+        self.register_buffer("gain", torch.as_tensor(float(gain)))
+        self.register_buffer("pivot", pivot)
+        self.register_buffer("strength", torch.as_tensor(float(strength)))
+
+    def forward(self, points: Points, center: Float[Tensor, "3"], start: Points | None = None) -> Displayed:
+        followed = center + self.strength * ((self.gain - 1) * (center - self.pivot) + self.offset)
+        shown = self.warp(points, followed, start)
+        return shown if torch.equal(followed, center) else painted(shown, followed)._replace(near=None)
+
+
+def inner_warp(warp: nn.Module) -> nn.Module:
+    """The rung below what edits have put around it."""
+    return inner_warp(warp.warp) if isinstance(warp, MovedWarp | DecoupledWarp) else warp
+
+
+def moved_mirror(
+    warp: nn.Module, scale: float, rotation: Float[Tensor, "3 3"], shift: Float[Tensor, "3"]
+) -> nn.Module | None:
+    """The mirror at x_new = scale * rotation x + shift, in surroundings that stay where they are: physically right.
+    None for rungs that do not consist of a mirror and world points."""
+    with torch.no_grad():
+        if isinstance(warp, PlaneWarp):
+            normal, distance = warp.plane()
+            return PlaneWarp(scale * rotation @ (distance * normal) + shift, rotation @ normal, float(warp.scale))
+        if isinstance(warp, QuadricWarp):
+            center, axes = warp.shape()
+            moved = scale * rotation @ center + shift, scale * rotation @ axes
+            return QuadricWarp(*moved, len(warp.log_radii) == 1, bool(warp.concave))
+    return None
 
 
 def learns_positions(warp: nn.Module) -> bool:
     """Whether a cloud's points move in training: the network alone displaces points that stay fixed (paper 4.2)."""
-    return learns_positions(warp.warp) if isinstance(warp, MovedWarp) else not isinstance(warp, NeuralWarp)
+    return not isinstance(inner_warp(warp), NeuralWarp)
 
 
 def warp_from_state(state: dict[str, Tensor]) -> nn.Module:
     """The warp that a state dictionary belongs to, filled."""
-    if "shift" in state and "rotation" in state:
+    if any(k.startswith("warp.") for k in state) or {"rotation", "pivot"} & state.keys():
         inner = warp_from_state({k.removeprefix("warp."): v for k, v in state.items() if k.startswith("warp.")})
+        if "pivot" in state:
+            return DecoupledWarp(inner, state["offset"], float(state["gain"]), state["pivot"], float(state["strength"]))
         return MovedWarp(inner, float(state["scale"]), state["rotation"], state["shift"])
     if "quadric.start_axes" in state:
         parts = {
