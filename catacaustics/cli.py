@@ -71,10 +71,10 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         getattr(importlib.import_module(module), function)(config)
     except UserError as error:
-        print(f"{prog}: {error}", file=sys.stderr)
+        print(f"catacaustics {command}: {error}", file=sys.stderr)
         return 2
     except KeyboardInterrupt:
-        print(f"{prog}: interrupted; finished work is kept", file=sys.stderr)
+        print(f"catacaustics {command}: interrupted; finished work is kept", file=sys.stderr)
         return 130
     return 0
 

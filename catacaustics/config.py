@@ -11,6 +11,10 @@ Model = Literal["auto", "none", "static", "plane", "sphere", "ellipsoid", "conca
 """Rungs of the ladder of warps (reflectors/warps.py); auto chooses by trials, none trains the primary cloud alone."""
 
 
+CameraPath = Literal["held-out", "spline", "still"]
+"""Camera paths of films."""
+
+
 @dataclass(frozen=True)
 class CalibrateConfig:
     """Photographs in, a calibrated capture with a fused point cloud out."""
@@ -193,12 +197,17 @@ class RenderConfig:
     """Folder that training wrote."""
     video: Path
     """MP4 file to write. Finished frames are kept beside it until it is complete."""
-    path: Literal["held-out", "spline"] = "held-out"
-    """held-out: through the held-out views in order; spline: a tour of the training views, nearest neighbour next."""
+    path: CameraPath = "held-out"
+    """held-out: through the held-out views in order; spline: a tour of the training views, nearest neighbour next;
+    still: the first held-out view."""
     layers: tuple[Literal["rgb", "primary", "reflection", "weight", "depth"], ...] = ("rgb",)
     """What to show; several layers stand side by side."""
     warp_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Reflections follow a camera displaced by this along the view's axes (right, down, forward; world units)."""
+    warp_path: CameraPath | None = None
+    """Reflections follow a camera on this path, whatever the view's; the offset comes on top."""
+    warp_reflector: str | None = None
+    """Only this reflector's reflections follow another camera; left out, all."""
     seconds: float = 10.0
     """Length of the video."""
     fps: float = 24.0
@@ -229,6 +238,14 @@ class EditConfig:
     """Colour that reflections are multiplied with (RGB)."""
     surroundings: Path | None = None
     """Latitude-longitude image that the reflector shall mirror instead."""
+    warp_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Reflections follow a camera displaced by this from the view's (world units and axes)."""
+    warp_gain: float = 1.0
+    """The reflections' camera moves this many times as fast as the view's; 0 freezes reflections."""
+    warp_pivot: tuple[float, float, float] | None = None
+    """Where both cameras are at the same place; left out, at the first held-out view."""
+    warp_strength: float = 1.0
+    """Share of the way from the view's camera to the reflections' camera that is gone; 0 leaves all as it is."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
 
 
@@ -246,6 +263,11 @@ class CloneConfig:
     """Rotation in degrees, as a vector along its axis."""
     scale: float = 1.0
     """Size of the copy."""
+    box: tuple[float, float, float, float, float, float] | None = None
+    """Copy the primary points between these corners (x y z x y z) instead of those in the reflection volume."""
+    surroundings: Literal["moved", "resting"] = "moved"
+    """moved: the copy mirrors what the original mirrors, as if its surroundings had come along; resting: it mirrors the
+    surroundings from where it stands, as a real mirror would (plane, sphere, ellipsoid, concave)."""
     reflector: str | None = None
     """Name of the reflector, where there are several."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -342,6 +364,82 @@ class RefractDataConfig:
     processes: int = 2
     variant: Literal["auto", "cuda_ad_rgb", "llvm_ad_rgb"] = "auto"
     """Mitsuba variant; auto takes CUDA where it works."""
+
+
+RefractModel = Literal["glassnet", "crystalnet", "ssnrb", "direct", "hybrid"]
+"""Renderers: without R-buffer; with texture, world or screen coordinates from their generator; with both of the
+first two."""
+
+
+@dataclass(frozen=True)
+class RefractTrainConfig:
+    """Train a refraction model: its R-buffer generator on coordinates, then its renderer with the generator frozen.
+
+    The defaults are for minutes on a CPU. The papers: --size paper --crop 0 --lr-generator 7.5e-5 --lr-renderer 1e-4
+    --lr-final-share 1, for hours on a GPU.
+    """
+
+    data: Path
+    """Folder made by `catacaustics refract data`."""
+    run: Path
+    """Folder to write: generator and renderer, checkpoints, metrics.jsonl."""
+    model: RefractModel = "hybrid"
+    """glassnet has no R-buffer, crystalnet looks colours up by texture coordinates, ssnrb on the screen by world
+    coordinates, direct by screen coordinates (ablation), hybrid by world or texture coordinates, as each pixel needs."""
+    part: Literal["both", "generator", "renderer"] = "both"
+    """Train only one; the renderer needs a trained generator in the run or in --generator."""
+    generator: Path | None = None
+    """Trained generator.safetensors to take instead of training one."""
+    resume: bool = False
+    """Go on from the run's last checkpoint."""
+    size: Literal["small", "base", "paper"] = "small"
+    """Of the networks: 16, 32 or 64 channels in the first level."""
+    minutes: float | None = None
+    """Stop after this much training time of both parts together; schedules then follow time instead of steps."""
+    generator_share: float = 0.5
+    """Of the minutes; a model without generator gives them all to its renderer."""
+    steps: int = 20_000
+    """Optimiser steps of each part, at most."""
+    clock: Literal["wall", "cpu"] = "wall"
+    """What minutes are measured by; cpu: processor time of this process, fair where others use the machine too."""
+    batch: int = 4
+    crop: int = 64
+    """Side of the square training crops in pixels; 0 takes whole images."""
+    glass_share: float = 0.8
+    """Share of the crops centred on a refractive pixel; the others are anywhere."""
+    lr_generator: float = 2e-3
+    lr_renderer: float = 2e-3
+    lr_final_share: float = 0.01
+    """Rates fall to this share of their start along a half cosine; 1 keeps them."""
+    weight_decay: float = 1e-4
+    weight_coordinates: float = 1.0
+    weight_tv: float = 1.5e-8
+    """Total variation of coordinates, summed over an image."""
+    weight_index: float = 1.0
+    weight_normal: float = 2.0
+    weight_l1: float = 1.0
+    weight_dssim: float = 1.0
+    content: Literal["both", "color", "normal"] = "both"
+    """What the renderer gets of the R-buffer."""
+    cache_gb: float = 4.0
+    """Memory for frames that are kept; others are read from disk each time."""
+    checkpoint_minutes: float = 2.0
+    seed: int = 0
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+
+
+@dataclass(frozen=True)
+class RefractEvaluateConfig:
+    """Measure a trained refraction model on held-out frames: metrics, speed, pictures side by side."""
+
+    run: Path
+    """Folder that `catacaustics refract train` wrote."""
+    data: Path | None = None
+    """The data set, where it is not the one of the training."""
+    split: Literal["test", "val", "train"] = "test"
+    shown_frames: int = 8
+    """Frames with pictures in the report, spread over the split."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import torch
 
-from catacaustics.capture.dataset import Capture, open_capture
+from catacaustics.capture.dataset import Capture, View, open_capture
 from catacaustics.errors import UserError
 from catacaustics.files import read_json
 from catacaustics.scene import Scene
@@ -20,6 +20,25 @@ class Run(NamedTuple):
     scene: Scene
     capture: Capture
     config: dict[str, Any]
+
+
+def named_view(capture: Capture, name: str | None) -> View:
+    """A view by name; without one the first held-out view, or the first training view where none is held out.
+
+    Raises:
+        UserError: no view of that name.
+    """
+    if name is None:
+        return [*capture.held_out, *capture.train][0]
+    views = {v.name: v for v in capture.views}
+    if name not in views:
+        few = sorted(views)[:6]
+        raise UserError(
+            f"{capture.root} has no view {name}.",
+            f"one of {len(views)} names: {', '.join(few)}{' ...' if len(views) > len(few) else ''}",
+            "name it as its file below images/",
+        )
+    return views[name]
 
 
 def scene_file(folder: Path, unfinished: bool = False) -> Path:

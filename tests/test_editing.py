@@ -1,5 +1,8 @@
 """Edits leave what they do not touch, and move what they do as they say."""
 
+import functools
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -11,6 +14,7 @@ from catacaustics.config import TrainConfig
 from catacaustics.editing import (
     adjust_reflections,
     clone_reflector,
+    decouple_reflections,
     reflector_index,
     replace_surroundings,
 )
@@ -26,6 +30,7 @@ def capture(tmp_path_factory):
     return open_capture(make_toy_capture(tmp_path_factory.mktemp("editing")))
 
 
+@functools.cache  # edits leave scenes as they are
 def scene_of(capture, model):
     config = TrainConfig(
         capture.root,
@@ -78,8 +83,6 @@ def test_a_clone_moved_by_d_and_seen_from_c_is_the_original_seen_from_c_minus_d(
     camera = capture.held_out[0].camera.resized(128, 96)
     shift = np.array([1.6, 0.0, -0.4])
     cloned = clone_reflector(scene, 0, shift, np.eye(3))
-    from dataclasses import replace
-
     there = camera.camera_from_world.copy()
     there[:3, 3] -= there[:3, :3] @ shift  # the camera at c + d
     here, beyond = scene.render(camera), cloned.render(replace(camera, camera_from_world=there))
@@ -90,14 +93,135 @@ def test_a_clone_moved_by_d_and_seen_from_c_is_the_original_seen_from_c_minus_d(
         assert ((one - other) ** 2).mean() < 1e-4, layer  # 40 dB
 
 
-def test_a_clone_at_the_same_place_looks_like_the_original(capture, ball):
-    camera = capture.held_out[0].camera
-    cloned = clone_reflector(ball, 0, *STILL)
+@pytest.mark.parametrize("model", ["sphere", "plane", "neural"])
+def test_a_clone_that_is_not_moved_changes_nothing(capture, model):
+    scene = scene_of(capture, model)
+    cloned = clone_reflector(scene, 0, *STILL)
+    assert [v.name for v in cloned.volumes] == ["ball"]
+    assert len(cloned.primary) == len(scene.primary)
+    for view in (capture.held_out[0], capture.train[3]):
+        before, after = scene.render(view.camera), cloned.render(view.camera)
+        for layer in before._fields:
+            torch.testing.assert_close(getattr(after, layer), getattr(before, layer), atol=1e-5, rtol=1e-5)
+
+
+def test_what_was_where_a_clone_stands_gives_way(capture, ball):
+    shift = np.array([0.9, 0.1, 0.2])
+    cloned = clone_reflector(ball, 0, shift, np.eye(3))
     assert [v.name for v in cloned.volumes] == ["ball", "ball copy"]
-    assert len(cloned.primary) > len(ball.primary)
-    difference = (cloned.render(camera).reflection_rgb - ball.render(camera).reflection_rgb).abs()
-    inside = torch.from_numpy(ball.volumes[0].scaled(0.8).project_mask(camera))
-    assert float(difference[inside].mean()) < 0.05
+    space = cloned.volumes[1].scaled(1.03)
+    before = ball.primary.positions.detach().numpy().astype(np.float64)
+    after = cloned.primary.positions.detach().numpy().astype(np.float64)
+    own = ball.volumes[0].scaled(1.03).contains(before).sum()
+    assert space.contains(before).sum() > 0
+    assert space.contains(after).sum() == pytest.approx(own, abs=2)  # rounding at the volume's surface
+    assert clone_reflector(cloned, 0, -shift, np.eye(3)).volumes[2].name == "ball copy 2"
+
+
+def test_a_box_chooses_what_is_copied_along(capture, ball):
+    low, high = np.array([-0.6, -0.8, -0.6]), np.array([0.6, 0.1, 0.6])
+    points = ball.primary.positions.detach().numpy()
+    inside = ((points >= low) & (points <= high)).all(1)
+    cloned = clone_reflector(ball, 0, np.array([0, 0, 5.0]), np.eye(3), box=np.stack([high, low]))
+    assert len(cloned.primary) == len(ball.primary) + inside.sum()
+    copies = cloned.primary.positions.detach().numpy()[-inside.sum() :]
+    np.testing.assert_allclose(copies, points[inside] + [0, 0, 5.0], atol=1e-5)
+    with pytest.raises(UserError, match="no primary points in the box"):
+        clone_reflector(ball, 0, *STILL, box=np.array([[50.0, 50, 50], [51, 51, 51]]))
+
+
+@pytest.mark.parametrize("model", ["sphere", "ellipsoid", "plane"])
+def test_a_clone_in_resting_surroundings_obeys_fermat_at_its_new_place(capture, model):
+    """Where a point is displayed, the light's path from it over the mirror is the shortest, by brute force."""
+    scene = scene_of(capture, model)
+    turn = np.array([[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1.0]])
+    shift = np.array([0.4, -0.1, 0.2])
+    cloned = clone_reflector(scene, 0, shift, turn, 0.7, resting=True)
+    center = torch.from_numpy(capture.train[0].camera.center).float()
+    points = cloned.reflections[1].positions
+    shown = cloned.warps[1](points, center)
+    # The surface: the original's, moved.
+    old, move = scene.warps[0], scene.volumes[0].center + shift - 0.7 * turn @ scene.volumes[0].center
+    if model == "plane":
+        normal, distance = (t.detach().numpy() for t in old.plane())
+        grid = np.stack([g.ravel() for g in np.meshgrid(*[np.linspace(-8, 8, 601)] * 2)], -1)
+        across = np.linalg.svd(normal[None])[2][1:]
+        surface = distance * normal + grid @ across
+    else:
+        middle, axes = (t.detach().numpy() for t in old.shape())
+        from catacaustics.geometry import sphere_directions
+
+        surface = middle + sphere_directions(50_000) @ axes.T
+    surface = 0.7 * surface @ turn.T + move
+    eye = center.numpy()
+    checked = torch.nonzero(shown.visible)[::80, 0].tolist()
+    assert len(checked) > 2
+    for i in checked:
+        ray = shown.positions[i].detach().numpy() - eye
+        touch = eye + ray / np.linalg.norm(ray) * float(shown.near[i])
+        way = np.linalg.norm(surface - eye, axis=1) + np.linalg.norm(surface - points[i].detach().numpy(), axis=1)
+        assert np.linalg.norm(surface[way.argmin()] - touch) < 0.03
+
+
+def test_only_mirrors_can_stand_in_resting_surroundings(capture):
+    with pytest.raises(UserError, match="NeuralWarp"):
+        clone_reflector(scene_of(capture, "neural"), 0, *STILL, resting=True)
+
+
+@pytest.mark.parametrize("model", ["sphere", "plane", "neural"])
+def test_reflections_decoupled_by_nothing_are_the_same_bit_for_bit(capture, model):
+    scene, camera = scene_of(capture, model), capture.held_out[0].camera
+    before = scene.render(camera)
+    for edited in (
+        decouple_reflections(scene, 0, np.zeros(3)),
+        decouple_reflections(scene, 0, np.array([1.0, 2, 3]), 3.0, np.ones(3), strength=0.0),
+        decouple_reflections(scene, 0, np.zeros(3), 3.0, camera.center),  # at the pivot
+    ):
+        after = edited.render(camera)
+        assert torch.equal(after.reflection_rgb, before.reflection_rgb) or edited.warps[0].gain == 3
+        torch.testing.assert_close(after.rgb, before.rgb, atol=2e-3, rtol=0)
+    assert torch.equal(decouple_reflections(scene, 0, np.zeros(3)).render(camera).rgb, before.rgb)
+
+
+def test_a_decoupled_scene_shows_what_a_warp_camera_shows(capture, ball, tmp_path):
+    camera = capture.held_out[0].camera
+    offset = np.array([0.3, -0.1, 0.2])
+    edited = decouple_reflections(ball, 0, offset, strength=0.5)
+    aside = replace(camera, camera_from_world=camera.camera_from_world.copy())
+    aside.camera_from_world[:3, 3] -= aside.camera_from_world[:3, :3] @ offset / 2
+    expected = ball.render(camera, warp_camera=aside)
+    torch.testing.assert_close(edited.render(camera).rgb, expected.rgb, atol=1e-3, rtol=0)
+    assert float((expected.rgb - ball.render(camera).rgb).abs().max()) > 0.1
+    edited.save(tmp_path / "scene.safetensors")
+    assert torch.equal(Scene.load(tmp_path / "scene.safetensors").render(camera).rgb, edited.render(camera).rgb)
+
+
+def test_frozen_reflections_are_painted_on_the_mirror(capture, ball):
+    pivot = capture.train[0].camera.center
+    frozen = decouple_reflections(ball, 0, np.zeros(3), 0.0, pivot)
+    points = frozen.reflections[0].positions
+    first, second = (frozen.warps[0](points, torch.from_numpy(v.camera.center).float()) for v in capture.train[1:3])
+    torch.testing.assert_close(first.positions, second.positions)
+    middle, axes = ball.warps[0].shape()
+    seen = first.positions[first.visible] - middle
+    torch.testing.assert_close(seen.norm(dim=1), axes[0, 0].expand(len(seen)), rtol=0.02, atol=0)
+
+
+def test_each_reflector_can_follow_a_camera_of_its_own(capture, ball):
+    camera = capture.held_out[0].camera.resized(128, 96)
+    two = clone_reflector(ball, 0, 0.85 * camera.camera_from_world[0, :3], np.eye(3), 0.6)
+    aside = camera.displaced(np.array([0.4, 0, 0]))
+    plain, moved = two.render(camera), two.render(camera, warp_camera=[None, aside])
+    changed = (plain.reflection_rgb - moved.reflection_rgb).abs().sum(-1) > 0.02
+    first, second = (torch.from_numpy(v.project_mask(camera)) for v in two.volumes)
+    assert changed.any()
+    assert not changed[first & ~second].any()
+    assert torch.equal(two.render(camera, warp_camera=[aside, aside]).rgb, two.render(camera, warp_camera=aside).rgb)
+
+
+def test_painted_highlights_follow_no_camera(capture):
+    with pytest.raises(UserError, match="whatever camera"):
+        decouple_reflections(scene_of(capture, "static"), 0, np.ones(3))
 
 
 def test_a_turned_and_scaled_clone_is_saved_and_loaded(capture, ball, tmp_path):
@@ -117,6 +241,7 @@ def test_the_scene_that_is_edited_stays_as_it_was(capture, ball):
     camera = capture.held_out[0].camera
     before = ball.render(camera).rgb
     clone_reflector(ball, 0, *STILL)
+    decouple_reflections(ball, 0, np.ones(3))
     adjust_reflections(ball, 0, 0.0)
     replace_surroundings(ball, 0, np.zeros((4, 8, 3)))
     assert torch.equal(ball.render(camera).rgb, before)
@@ -148,6 +273,17 @@ def test_other_surroundings_are_mirrored_from_their_direction(capture, ball):
     assert image[bottom, middle, 2] > image[bottom, middle, 0]
 
 
+def test_the_surroundings_of_a_turned_clone_turned_along(capture, ball):
+    """Half a turn about a level axis: what was up is down."""
+    panorama = np.zeros((16, 32, 3), np.float32)
+    panorama[:8], panorama[8:] = [1.0, 0, 0], [0, 0, 1.0]
+    turned = clone_reflector(ball, 0, np.zeros(3), np.diag([1.0, -1, -1]))
+    up = ball.reflections[0].positions[:, 1] < ball.volumes[0].center[1]
+    colors = replace_surroundings(turned, 0, panorama).reflections[0].features.detach()
+    assert float(colors[up, 2].mean()) > 0.9
+    assert float(colors[~up, 0].mean()) > 0.9
+
+
 def test_surroundings_of_a_network_cannot_be_replaced(capture):
     with pytest.raises(UserError, match="do not know what they mirror"):
         replace_surroundings(scene_of(capture, "neural"), 0, np.zeros((4, 8, 3)))
@@ -164,14 +300,18 @@ def test_the_commands_write_runs_that_can_be_rendered_and_never_overwrite_one(ca
     ball.save(run / "scene.safetensors")
     write_json(run / "config.json", {"capture": str(capture.root), "image_size": 64})
     commands = {
-        "edit": ["--strength", "0.3", "--tint", "1", "0.5", "0.5"],
-        "clone": ["--shift", "1.2", "0", "0", "--turn", "0", "90", "0", "--scale", "0.5"],
+        "edit": ["--strength", "0.3", "--tint", "1", "0.5", "0.5", "--warp-gain", "2", "--warp-offset", "0", "0", "1"],
+        "clone": ["--shift", "1.2", "0", "0", "--turn", "0", "90", "0", "--scale", "0.5", "--surroundings", "resting"],
     }
     for command, options in commands.items():
         assert cli.main([command, str(run), str(tmp_path / command), *options]) == 0
         film = ["render", str(tmp_path / command), str(tmp_path / f"{command}.mp4"), "--width", "32"]
-        assert cli.main([*film, "--seconds", "0.3", "--fps", "8", "--warp-offset", "0.1", "0", "0"]) == 0
+        options_of_film = ["--warp-offset", "0.1", "0", "0", "--path", "still", "--warp-path", "held-out"]
+        assert cli.main([*film, "--seconds", "0.3", "--fps", "8", *options_of_film]) == 0
         assert cli.main([command, str(run), str(tmp_path / command), *options]) == 2
         assert "already holds a run" in capsys.readouterr().err
+    film = ["render", str(run), str(tmp_path / "a.mp4"), "--warp-reflector", "kettle"]
+    assert cli.main(film) == 2
+    assert "no reflector kettle" in capsys.readouterr().err
     assert [v.name for v in Scene.load(tmp_path / "clone" / "scene.safetensors").volumes] == ["ball", "ball copy"]
     assert cli.main(["clone", str(run), str(tmp_path / "other"), "--scale", "-1"]) == 2

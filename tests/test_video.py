@@ -250,7 +250,7 @@ def test_kept_frames_are_not_used_for_another_scene_or_layer(capture, tmp_path, 
 
 def test_a_spline_film_tours_the_training_views(capture, tmp_path, monkeypatch):
     run = open_run_of(StandInScene(capture), make_run(tmp_path / "run", capture), monkeypatch)
-    path = video.camera_path(run, RenderConfig(run.folder, tmp_path / "a.mp4", "spline", seconds=20.0, width=33))
+    path = video.camera_path(run.capture, "spline", video.frame_count(20.0, 24.0), 33)
     assert len(path) == 480
     assert {(c.width, c.height) for c in path} == {(32, 24)}
     for view in capture.train:

@@ -106,7 +106,7 @@ class ReflectionVolume:
         """At x_new = scale * rotation x + shift, under another name."""
         normals = self.halfspaces[:, :3] @ rotation.T
         planes = np.c_[normals, scale * self.halfspaces[:, 3] - normals @ shift]
-        return ReflectionVolume(name, planes, scale * self.vertices @ rotation.T + shift, self.faces)
+        return ReflectionVolume(name, planes, scale * self.vertices @ rotation.T + shift, self.faces.copy())
 
     def sample_surface(
         self, n: int, rng: np.random.Generator
