@@ -72,16 +72,17 @@ def report_view(
     return ReportView(
         row,
         [
-            _picture("Photograph", photo),
-            _picture("Render", layer_image(output, "rgb", depths)),
-            _picture(f"Error (FLIP{outline}) {_legend(ERROR_COLORMAP, '0', '1')}", error_image(flip, mask)),
+            encode_picture("Photograph", photo),
+            encode_picture("Render", layer_image(output, "rgb", depths)),
+            encode_picture(f"Error (FLIP{outline}) {legend_html(ERROR_COLORMAP, '0', '1')}", error_image(flip, mask)),
         ],
         [
-            _picture("Primary", layer_image(output, "primary", depths)),
-            _picture("Reflection", layer_image(output, "reflection", depths)),
-            _picture(f"Reflection weight {_legend('gray', '0', '1')}", layer_image(output, "weight", depths)),
-            _picture(
-                f"Depth {_legend(DEPTH_COLORMAP, f'{near:.3g}', f'{far:.3g}')}", layer_image(output, "depth", depths)
+            encode_picture("Primary", layer_image(output, "primary", depths)),
+            encode_picture("Reflection", layer_image(output, "reflection", depths)),
+            encode_picture(f"Reflection weight {legend_html('gray', '0', '1')}", layer_image(output, "weight", depths)),
+            encode_picture(
+                f"Depth {legend_html(DEPTH_COLORMAP, f'{near:.3g}', f'{far:.3g}')}",
+                layer_image(output, "depth", depths),
             ),
         ],
     )
@@ -126,9 +127,9 @@ def report_html(
         "photograph."
     )
     details = [
-        _details("Protocol", _protocol(protocol), opened=True),
-        _details("Every held-out view", _view_table(result["views"])),
-        _details("Training configuration", _definitions(config)),
+        details_html("Protocol", _protocol(protocol), opened=True),
+        details_html("Every held-out view", _view_table(result["views"])),
+        details_html("Training configuration", definitions_html(config)),
     ]
     sections = [
         f"<header>{header}{_summary(result['mean'])}{_links(folder, capture)}</header>",
@@ -136,18 +137,25 @@ def report_html(
         f"<section><h2>Training</h2>{_curves(log, skipped)}</section>",
         f"<section><h2>Details</h2>{''.join(details)}</section>",
     ]
+    return zoom_page(f"{name}: held-out evaluation", "\n".join(sections))
+
+
+def zoom_page(title: str, body: str, style: str = "") -> str:
+    """A page whose pictures (`picture_html`, in articles) can be enlarged and compared with the first of their
+    article."""
     script = Path(__file__).with_name("report.js").read_text()
-    after = f"\n{_DIALOG}\n<script>\n{script}</script>"
-    return html_page(f"{name}: held-out evaluation", "\n".join(sections), after=after)
+    return html_page(title, body, style, after=f"\n{_DIALOG}\n<script>\n{script}</script>")
 
 
-def _picture(caption: str, image: np.ndarray) -> Picture:
+def encode_picture(caption: str, image: np.ndarray) -> Picture:
+    """Encode an RGB or gray image for the page, reduced where it is large; the caption is HTML."""
     height, width = image.shape[:2]
     scale = min(1.0, _LONGER_SIDE / max(height, width))
     return Picture(caption, encode_image(resize(image, round(width * scale), round(height * scale)), ".jpg", 88))
 
 
-def _legend(colormap: str, low: str, high: str) -> str:
+def legend_html(colormap: str, low: str, high: str) -> str:
+    """A strip of a matplotlib colormap with the numbers at its ends."""
     colors = (colorize(np.linspace(0, 1, 9), colormap) * 255).round().astype(int)
     stops = ", ".join("#" + "".join(f"{c:02x}" for c in color) for color in colors.tolist())
     return (
@@ -203,12 +211,13 @@ def _view(view: ReportView) -> str:
     )
     return (
         f'<article><h3>{escape(row["name"])}</h3><p class="measured">{measured}</p>'
-        f'<div class="grid three">{"".join(map(_figure, view.comparison))}</div>'
-        f'<div class="grid four">{"".join(map(_figure, view.layers))}</div></article>'
+        f'<div class="grid three">{"".join(map(picture_html, view.comparison))}</div>'
+        f'<div class="grid four">{"".join(map(picture_html, view.layers))}</div></article>'
     )
 
 
-def _figure(picture: Picture) -> str:
+def picture_html(picture: Picture) -> str:
+    """A picture that can be enlarged, with its caption."""
     label = escape(re.sub(r"<.*", "", picture.caption).strip())
     data = base64.b64encode(picture.jpeg).decode()
     image = f'<img alt="{label}" src="data:image/jpeg;base64,{data}">'
@@ -325,7 +334,7 @@ def _view_table(rows: list[dict[str, Any]]) -> str:
 
 def _protocol(protocol: dict[str, Any]) -> str:
     masks = ", ".join(f"{count} {source}" for source, count in protocol["masks"].items())
-    return _definitions(
+    return definitions_html(
         {
             "Split": f"{protocol['split']['train']} training views, {protocol['split']['held_out']} held out",
             "Resolution": ", ".join(protocol["resolution"]) + " pixels, the size of the training",
@@ -338,12 +347,14 @@ def _protocol(protocol: dict[str, Any]) -> str:
     )
 
 
-def _definitions(values: dict[str, Any]) -> str:
+def definitions_html(values: dict[str, Any]) -> str:
+    """Names and values as a list."""
     rows = "".join(f"<dt>{escape(str(k))}</dt><dd>{escape(str(v))}</dd>" for k, v in values.items())
     return f"<dl>{rows}</dl>"
 
 
-def _details(title: str, body: str, opened: bool = False) -> str:
+def details_html(title: str, body: str, opened: bool = False) -> str:
+    """A part of the page that can be folded."""
     return f"<details{' open' if opened else ''}><summary>{title}</summary>{body}</details>"
 
 
