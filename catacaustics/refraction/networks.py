@@ -1,0 +1,140 @@
+"""The networks: encoder of transparent objects, U-Net, R-buffer generator and renderer. Images are channels first.
+
+Nothing is normalised over pixels or channels: an object that is nowhere seen contributes exactly nothing.
+"""
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import interpolate, relu
+
+from catacaustics.refraction.buffers import OBJECT_CHANNELS, Buffers
+from catacaustics.shapes import Float
+
+
+class Size(NamedTuple):
+    """Channels of the U-Nets' first level, levels below it, and octaves of the positional encoding."""
+
+    width: int
+    levels: int
+    octaves: int
+
+
+SIZES = {"small": Size(16, 3, 4), "base": Size(32, 3, 6), "paper": Size(64, 4, 8)}
+
+
+def encode(values: Float[Tensor, "b c h w"], octaves: int) -> Float[Tensor, "b d h w"]:
+    """Positional encoding x, sin(2^i pi x), cos(2^i pi x), i < octaves; d = c (1 + 2 octaves)."""
+    waves = [values * (torch.pi * 2**i) for i in range(octaves)]
+    return torch.cat([values, *(f(wave) for wave in waves for f in (torch.sin, torch.cos))], 1)
+
+
+def _join(*parts: Tensor) -> Tensor:
+    """Channels side by side, in the memory layout in which convolutions are fastest."""
+    return torch.cat(parts, 1).contiguous(memory_format=torch.channels_last)
+
+
+def _conv(inputs: int, outputs: int, side: int = 3, stride: int = 1) -> nn.Conv2d:
+    conv = nn.Conv2d(inputs, outputs, side, stride, side // 2)
+    nn.init.kaiming_normal_(conv.weight, nonlinearity="relu")
+    nn.init.zeros_(conv.bias)
+    return conv
+
+
+class UNet(nn.Module):
+    """Encoder and decoder with skips. Level i has width * min(2^i, 4) channels; the result has `width`."""
+
+    def __init__(self, inputs: int, size: Size):
+        super().__init__()
+        widths = [size.width * min(2**i, 4) for i in range(size.levels + 1)]
+        self.first = _conv(inputs, widths[0], 1)
+        pairs = list(pairwise(widths))
+        self.down = nn.ModuleList(_conv(a, b, stride=2) for a, b in pairs)
+        self.middle = nn.ModuleList(_conv(b, b) for _, b in pairs)
+        self.narrow = nn.ModuleList(_conv(b, a, 1) for a, b in pairs)
+        self.up = nn.ModuleList(_conv(a, a) for a, _ in pairs)
+
+    def forward(self, x: Tensor) -> Tensor:
+        x = relu(self.first(x))
+        skips = []
+        for down, middle in zip(self.down, self.middle, strict=True):
+            skips.append(x)
+            x = relu(down(x))
+            x = x + relu(middle(x))
+        for narrow, up in zip(reversed(self.narrow), reversed(self.up), strict=True):
+            x = interpolate(narrow(x), scale_factor=2, mode="bilinear", align_corners=False) + skips.pop()
+            x = relu(up(x))
+        return x
+
+
+class ObjectEncoder(nn.Module):
+    """Sum over the transparent objects of one shared network's features (GlassNet: k(sum h(x_k))).
+
+    The features are multiplied by the object's mask: order, and objects that are nowhere seen, do not matter.
+    """
+
+    def __init__(self, size: Size):
+        super().__init__()
+        self.octaves = size.octaves
+        inputs = OBJECT_CHANNELS + 3 * 2 * size.octaves + 3
+        self.first, self.second = _conv(inputs, size.width, 1), _conv(size.width, size.width, 1)
+
+    def forward(self, buffers: Buffers) -> Float[Tensor, "b c h w"]:
+        b, k = buffers.objects.shape[:2]
+        objects = buffers.objects.flatten(0, 1)
+        mask, position, rest = objects[:, :1], objects[:, 1:4], objects[:, 4:]
+        rays = buffers.rays.repeat_interleave(k, 0)
+        x = _join(mask, encode(position, self.octaves), rest, rays)
+        x = relu(self.second(relu(self.first(x)))) * mask
+        return x.unflatten(0, (b, k)).sum(1)
+
+
+class Generator(nn.Module):
+    """R-buffer generator: objects and opaque geometry in, `outputs` channels of coordinates, logits, normals out."""
+
+    def __init__(self, outputs: int, size: Size):
+        super().__init__()
+        self.octaves = size.octaves
+        self.objects = ObjectEncoder(size)
+        self.trunk = UNet(size.width + 3 * (1 + 2 * size.octaves) + 3 + 1 + 3, size)
+        self.head = nn.Sequential(_conv(size.width + size.width, 2 * size.width, 1), nn.ReLU())
+        self.last = nn.Conv2d(2 * size.width, outputs, 1)
+        nn.init.zeros_(self.last.bias)
+
+    def forward(self, buffers: Buffers) -> Float[Tensor, "b outputs h w"]:
+        objects = self.objects(buffers)
+        geometry = [encode(buffers.position, self.octaves), buffers.normal, buffers.depth, buffers.rays]
+        x = self.trunk(_join(objects, *geometry))
+        return self.last(self.head(_join(x, objects)))
+
+
+class Renderer(nn.Module):
+    """G-buffers and, where `r_channels` > 0, an R-buffer in; the lit image out.
+
+    Reflection branch: a U-Net on the opaque buffers, which also yields the scene's latent code. Transmission branch: a
+    U-Net on objects, code and R-buffer. A final network joins them; it gives a colour and what share of the direct
+    lighting and of the R-buffer's colour is added to it.
+    """
+
+    def __init__(self, r_channels: int, size: Size):
+        super().__init__()
+        self.octaves, self.r_channels = size.octaves, r_channels
+        self.reflection = UNet(3 * (1 + 2 * size.octaves) + 3 + 3 + 3 + 1 + 3, size)
+        self.objects = ObjectEncoder(size)
+        self.transmission = UNet(2 * size.width + r_channels, size)
+        self.join = _conv(2 * size.width + r_channels, size.width)
+        self.last = nn.Conv2d(size.width, 9 if r_channels else 6, 1)
+        nn.init.zeros_(self.last.weight)
+        nn.init.zeros_(self.last.bias)
+        self.last.bias.data[3:6] = 1.0  # at the start the image is the direct lighting
+
+    def forward(self, buffers: Buffers, r_buffer: Float[Tensor, "b r h w"]) -> Float[Tensor, "b 3 h w"]:
+        """RGB, sRGB-encoded, not clamped. The first three channels of the R-buffer are its colour."""
+        geometry = [encode(buffers.position, self.octaves), buffers.normal, buffers.depth, buffers.rays]
+        code = self.reflection(_join(*geometry, buffers.albedo, buffers.direct))
+        through = self.transmission(_join(code, self.objects(buffers), r_buffer))
+        out = self.last(relu(self.join(_join(code, through, r_buffer))))
+        image = out[:, :3] + out[:, 3:6] * buffers.direct
+        return image + out[:, 6:9] * r_buffer[:, :3] if self.r_channels else image

@@ -1,0 +1,372 @@
+"""`catacaustics refract train`: the generator alone, on coordinates; then the renderer, with the generator frozen."""
+
+import json
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.utils.data import ConcatDataset
+from tqdm import tqdm
+
+from catacaustics.config import RefractTrainConfig
+from catacaustics.errors import UserError
+from catacaustics.files import write_json
+from catacaustics.losses import dssim
+from catacaustics.refraction.buffers import BufferCache, Buffers, frame_buffers, frame_screen, stack
+from catacaustics.refraction.frames import Frames, open_frames
+from catacaustics.refraction.lookup import Screen
+from catacaustics.refraction.models import (
+    Layout,
+    LossWeights,
+    RefractionModel,
+    check_layout,
+    fill,
+    generator_losses,
+    kind_of,
+    load_part,
+    needs_screen,
+    save_part,
+    split_output,
+)
+from catacaustics.run import choose_device
+from catacaustics.training.optimizer import optimizer_tensors, restore_optimizer
+
+_LOG_EVERY = 10
+_LONGEST_GRADIENT = 1.0
+"""Longer gradients are shortened to this; usual ones are a tenth of it."""
+Place = tuple[int, int, int]
+"""A training crop: frame, first row, first column."""
+
+
+@dataclass
+class PartState:
+    """Everything that a part's checkpoint keeps."""
+
+    network: nn.Module
+    optimizer: torch.optim.Optimizer
+    rng: np.random.Generator
+    step: int = 0
+    seconds: float = 0.0
+    queue: list[int] = field(default_factory=list)
+
+
+@dataclass(frozen=True)
+class _Part:
+    """What differs between training a generator and a renderer."""
+
+    name: str
+    indices: range
+    """Frames to draw from."""
+    rate: float
+    minutes: float | None
+    losses: Callable[[Buffers, list[Place]], dict[str, Tensor]]
+
+
+def train(config: RefractTrainConfig) -> RefractionModel:
+    """Train a model, or one part of it; finished parts are kept. Writes RUN/generator.safetensors and
+    RUN/renderer.safetensors, and checkpoints while at it.
+
+    Raises:
+        UserError: no data, unknown model, an unfinished run without --resume, a generator of another layout, or a value
+            that is not finite.
+        KeyboardInterrupt: after the checkpoint was saved.
+    """
+    kind, run = kind_of(config.model), Path(config.run)
+    frames = open_frames(config.data)
+    _check(config, frames)
+    write_json(run / "config.json", {k: str(v) if isinstance(v, Path) else v for k, v in asdict(config).items()})
+    torch.manual_seed(config.seed)
+    model = RefractionModel(config.model, config.size, Layout.of(frames), frames.textures, choose_device(config.device))
+    train_frames, more = frames.split("train"), frames.split("generator")
+    cache = BufferCache(ConcatDataset([train_frames, more]), config.cache_gb * 2**30)
+    share = config.generator_share if kind else 0.0
+    if kind and config.part != "renderer" and config.generator is None:
+        every = range(len(train_frames) + len(more))
+        minutes = config.minutes and config.minutes * share
+        losses = _generator_step(model, config)
+        _fit(model.generator, _Part("generator", every, config.lr_generator, minutes, losses), cache, model, config)
+    if config.part != "generator":
+        if model.generator is not None:
+            path = config.generator or run / "generator.safetensors"
+            _take_generator(model, path)
+            save_part(run / "generator.safetensors", model.generator, load_part(path)[2])
+        minutes = config.minutes and config.minutes * (1 - share)
+        losses = _renderer_step(model, cache, config)
+        part = _Part("renderer", range(len(train_frames)), config.lr_renderer, minutes, losses)
+        _fit(model.renderer, part, cache, model, config)
+    return model.eval()
+
+
+def _check(config: RefractTrainConfig, frames: Frames) -> None:
+    run = Path(config.run)
+    side = int(frames.card["resolution"])
+    check_layout(Layout.of(frames), config.size, frames, min(config.crop, side) or side)
+    if not len(frames.split("train")):
+        raise UserError(f"{config.data} has no training frames.", "one or more", "make them: --train of refract data")
+    if config.part == "generator" and kind_of(config.model) is None:
+        raise UserError(f"{config.model} has no generator.", "another model or part", "leave --part out")
+    parts = ("generator", "renderer") if config.part == "both" else (config.part,)
+    found = [p for p in parts for f in (f"{p}.safetensors", f"{p}.checkpoint.safetensors") if (run / f).exists()]
+    if found and not config.resume:
+        raise UserError(
+            f"{run} already holds a {found[0]}.", "an empty folder", "add --resume to go on, or choose another folder"
+        )
+
+
+def _take_generator(model: RefractionModel, path: Path) -> None:
+    """Load and freeze a trained generator.
+
+    Raises:
+        UserError: it is missing, damaged, of another kind or of another layout.
+    """
+    weights, _, header = load_part(path)
+    if (header["model"], header["layout"]) != (model.name, model.layout):
+        raise UserError(
+            f"{path} is the generator of {header['model']} for the scene {header['layout'].scene!r}.",
+            f"that of {model.name} for the scene {model.layout.scene!r} with the same textures",
+            "take another generator, or train one: leave --generator out",
+        )
+    assert model.generator is not None
+    fill(model.generator, weights, path)
+    model.generator.requires_grad_(False)
+
+
+# What a step learns ----------------------------------------------------------------------------------------------
+
+
+def _generator_step(
+    model: RefractionModel, config: RefractTrainConfig
+) -> Callable[[Buffers, list[Place]], dict[str, Tensor]]:
+    kind = model.kind
+    assert model.generator is not None
+    assert kind is not None
+    weights = LossWeights(config.weight_coordinates, config.weight_tv, config.weight_index, config.weight_normal)
+
+    def losses(batch: Buffers, places: list[Place]) -> dict[str, Tensor]:
+        return generator_losses(kind, split_output(kind, model.generator(batch)), batch, weights)
+
+    return losses
+
+
+def _renderer_step(
+    model: RefractionModel, cache: BufferCache, config: RefractTrainConfig
+) -> Callable[[Buffers, list[Place]], dict[str, Tensor]]:
+    """L1 + DSSIM. The generator is frozen, so every frame's R-buffer is computed once and kept."""
+    baked: dict[int, Tensor] = {}
+    device = next(model.renderer.parameters()).device
+
+    def r_buffer(index: int) -> Tensor:
+        if index not in baked:
+            screen: Screen | None = None
+            if needs_screen(model.kind):
+                frame = cache.frames[index]
+                cache.keep(index, frame_buffers(frame))
+                screen = Screen(*(value.to(device) for value in frame_screen(frame)))
+            with torch.no_grad():
+                whole = model.bake(cache.get(index).to(device), screen)
+            baked[index] = keep_content(whole, config.content).half().cpu()
+        return baked[index]
+
+    def losses(batch: Buffers, places: list[Place]) -> dict[str, Tensor]:
+        side = batch.reference.shape[-1]
+        parts = [r_buffer(i)[..., y : y + side, x : x + side] for i, y, x in places]
+        image = model.renderer(batch, torch.cat(parts).to(device).float())
+        error = (image - batch.reference).abs().mean()
+        b, c, height, width = image.shape
+        planes = (x.permute(2, 3, 0, 1).reshape(height, width, b * c) for x in (image, batch.reference))
+        return {"l1": config.weight_l1 * error, "dssim": config.weight_dssim * dssim(*planes)}
+
+    return losses
+
+
+def keep_content(r_buffer: Tensor, content: str) -> Tensor:
+    """The R-buffer with colour or normal set to zero, where not both are wanted."""
+    if content == "both" or not r_buffer.shape[1]:
+        return r_buffer
+    keep = torch.zeros(r_buffer.shape[1], device=r_buffer.device)
+    keep[slice(0, 3) if content == "color" else slice(3, 6)] = 1
+    return r_buffer * keep[:, None, None]
+
+
+# The loop --------------------------------------------------------------------------------------------------------
+
+
+def _fit(
+    network: nn.Module | None, part: _Part, cache: BufferCache, model: RefractionModel, config: RefractTrainConfig
+) -> None:
+    """Train one part to the end of its steps or minutes; a part that is finished is loaded."""
+    assert network is not None
+    run = Path(config.run)
+    finished = run / f"{part.name}.safetensors"
+    if finished.exists():
+        fill(network, load_part(finished)[0], finished)
+        print(f"training: {finished} is finished already, kept")
+        return
+    state = _start(network, part, config)
+    try:
+        _loop(state, part, cache, model, config)
+    except KeyboardInterrupt:
+        _save(state, part, model, config)
+        print(f"training: interrupted at step {state.step} of the {part.name}, checkpoint saved; go on with --resume")
+        raise
+    _save(state, part, model, config)
+    save_part(finished, network, _header(state, model))
+
+
+def _start(network: nn.Module, part: _Part, config: RefractTrainConfig) -> PartState:
+    groups = [{"params": [p], "name": name} for name, p in network.named_parameters()]
+    optimizer = torch.optim.AdamW(groups, weight_decay=config.weight_decay, fused=True)
+    state = PartState(network, optimizer, np.random.default_rng([config.seed, part.name == "renderer"]))
+    path = Path(config.run) / f"{part.name}.checkpoint.safetensors"
+    if path.exists():
+        weights, extra, header = load_part(path)
+        fill(network, weights, path)
+        restore_optimizer(state.optimizer, extra)
+        state.rng.bit_generator.state = header["rng"]
+        state.step, state.seconds, state.queue = header["step"], header["seconds"], header["queue"]
+        _trim_log(Path(config.run), part.name, state.step)
+        print(f"training: going on from step {state.step} of the {part.name}")
+    return state
+
+
+def _header(state: PartState, model: RefractionModel) -> dict[str, Any]:
+    layout = [model.layout.scene, *model.layout.textures]
+    return {"model": model.name, "size": model.size, "layout": layout, "step": state.step, "seconds": state.seconds}
+
+
+def _save(state: PartState, part: _Part, model: RefractionModel, config: RefractTrainConfig) -> None:
+    """Weights, Adam's moments, random state and place in the schedule, in one atomic file.
+
+    Raises:
+        UserError: a weight is not finite; the older checkpoint stays.
+    """
+    bad = _first_not_finite(dict(state.network.named_parameters()))
+    if bad:
+        raise _not_finite(f"weight {bad} of the {part.name}", state.step)
+    notes = {"queue": state.queue, "rng": state.rng.bit_generator.state}
+    path = Path(config.run) / f"{part.name}.checkpoint.safetensors"
+    save_part(path, state.network, _header(state, model) | notes, optimizer_tensors(state.optimizer))
+
+
+def _trim_log(run: Path, part: str, step: int) -> None:
+    """Drop what was logged after the checkpoint: those steps are done again."""
+    path = run / "metrics.jsonl"
+    if path.exists():
+        rows = [json.loads(line) for line in path.read_text().splitlines() if line.endswith("}")]
+        kept = [row for row in rows if row["part"] != part or row["step"] <= step]
+        path.write_text("".join(json.dumps(row) + "\n" for row in kept))
+
+
+def _progress(state: PartState, part: _Part, config: RefractTrainConfig) -> float:
+    by_step = state.step / config.steps
+    return max(by_step, state.seconds / (60 * part.minutes)) if part.minutes else by_step
+
+
+def _loop(
+    state: PartState, part: _Part, cache: BufferCache, model: RefractionModel, config: RefractTrainConfig
+) -> None:
+    clock = time.monotonic if config.clock == "wall" else time.process_time
+    device = next(state.network.parameters()).device
+    started, saved = clock() - state.seconds, time.monotonic()
+    state.network.train()
+    layout = "{desc}: {percentage:3.0f}% |{bar}| {elapsed}, {remaining} left{postfix}"
+    begun = int(1000 * _progress(state, part, config))
+    bar = tqdm(total=1000, initial=begun, desc=part.name, mininterval=1.0, bar_format=layout)
+    with bar, (Path(config.run) / "metrics.jsonl").open("a") as log:
+        while (progress := _progress(state, part, config)) < 1:
+            low = config.lr_final_share
+            for group in state.optimizer.param_groups:
+                group["lr"] = part.rate * (low + (1 - low) * (1 + math.cos(math.pi * progress)) / 2)
+            batch, places = _draw(state, part, cache, config)
+            record = _step(state, part, batch.to(device), places)
+            state.step += 1
+            state.seconds = clock() - started
+            if state.step % _LOG_EVERY == 0:
+                row = {"part": part.name, "step": state.step, "seconds": round(state.seconds, 2)}
+                log.write(json.dumps(row | {k: round(v, 6) for k, v in record.items()}) + "\n")
+                log.flush()
+                bar.set_postfix(step=state.step, loss=f"{record['loss']:.4f}")
+                bar.update(int(1000 * min(_progress(state, part, config), 1)) - bar.n)
+            if time.monotonic() - saved > 60 * config.checkpoint_minutes:
+                _save(state, part, model, config)
+                saved = time.monotonic()
+
+
+def _draw(state: PartState, part: _Part, cache: BufferCache, config: RefractTrainConfig) -> tuple[Buffers, list[Place]]:
+    """A batch of crops. Every frame is drawn once before any is drawn again."""
+    crops, places = [], []
+    for _ in range(config.batch):
+        if not state.queue:
+            state.queue = state.rng.permutation(part.indices).tolist()
+        index = state.queue.pop()
+        whole = cache.get(index)
+        y, x, side = _choose_crop(whole, config, state.rng)
+        crops.append(whole.crop(y, x, side))
+        places.append((index, y, x))
+    return stack(crops), places
+
+
+def _choose_crop(whole: Buffers, config: RefractTrainConfig, rng: np.random.Generator) -> Place:
+    """First row, first column and side: around a refractive pixel, or anywhere."""
+    full = whole.depth.shape[-1]
+    side = min(config.crop, full) or full
+    if side == full:
+        return 0, 0, side
+    glass = whole.refractive[0, 0].flatten().nonzero()
+    if len(glass) and rng.random() < config.glass_share:
+        pixel = int(glass[rng.integers(len(glass))])
+        y, x = (min(max(at - side // 2, 0), full - side) for at in divmod(pixel, full))
+        return y, x, side
+    y, x = rng.integers(0, full - side + 1, 2).tolist()
+    return y, x, side
+
+
+def _step(state: PartState, part: _Part, batch: Buffers, places: list[Place]) -> dict[str, float]:
+    """One optimiser step.
+
+    Raises:
+        UserError: a value that is not finite; the weights are those before the step.
+    """
+    state.optimizer.zero_grad(set_to_none=True)
+    losses = part.losses(batch, places)
+    total = torch.stack(list(losses.values())).sum()
+    total.backward()
+    norm = torch.nn.utils.clip_grad_norm_(state.network.parameters(), _LONGEST_GRADIENT)
+    if not torch.isfinite(norm + total.detach()):
+        raise _not_finite(_culprit(state, part, batch, places, losses), state.step)
+    state.optimizer.step()
+    return {"loss": total.item()} | {name: value.item() for name, value in losses.items()}
+
+
+def _culprit(state: PartState, part: _Part, batch: Buffers, places: list[Place], losses: dict[str, Tensor]) -> str:
+    """The first tensor that is not finite, in the order in which they are computed."""
+    frames = ", ".join(str(index) for index, *_ in places)
+    bad = _first_not_finite(batch._asdict())
+    if bad:
+        return f"buffer {bad} of one of the training frames {frames}"
+    bad = _first_not_finite(dict(state.network.named_parameters()))
+    if bad:
+        return f"weight {bad} of the {part.name}"
+    bad = _first_not_finite(losses)
+    if bad:
+        return f"loss {bad} of the {part.name}, frames {frames},"
+    gradients = {n: p.grad for n, p in state.network.named_parameters() if p.grad is not None}
+    return f"gradient of {_first_not_finite(gradients)} of the {part.name}, frames {frames},"
+
+
+def _first_not_finite(tensors: dict[str, Tensor]) -> str | None:
+    return next((name for name, value in tensors.items() if not torch.isfinite(value).all()), None)
+
+
+def _not_finite(name: str, step: int) -> UserError:
+    return UserError(
+        f"The {name} is not finite at step {step}.",
+        "finite numbers",
+        "the last checkpoint is kept: lower the learning rate and go on with --resume, or make that shard again",
+    )
