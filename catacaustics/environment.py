@@ -22,14 +22,14 @@ class EnvironmentMap(nn.Module):
 
     def __init__(self, width: int = 1000, height: int = 400):
         super().__init__()
-        self.features = nn.Parameter(torch.zeros(FEATURES, height, width))
+        self.features = nn.Parameter(torch.zeros(height, width, FEATURES))
 
     def start_from(
         self, directions: Float[Tensor, "n 3"], colors: Float[Tensor, "n 3"], weights: Float[Tensor, "n"]
     ) -> None:
         """Set the colours (the first three features) to weighted means of what was seen; texels that saw little take
         them from coarser levels (push-pull, Gortler et al. 1996)."""
-        _, height, width = self.features.shape
+        height, width, _ = self.features.shape
         row, column = texels(directions, height, width)
         sums = colors.new_zeros(4, height * width)
         sums.index_add_(1, row * width + column, torch.cat([colors * weights[:, None], weights[:, None]], 1).T)
@@ -42,16 +42,23 @@ class EnvironmentMap(nn.Module):
             # A prior of one pixel's weight from the coarser level.
             filled = (level[:, :3] + coarse) / (level[:, 3:] + 1)
         with torch.no_grad():
-            self.features[:3] = filled[0]
+            self.features[..., :3] = filled[0].permute(1, 2, 0)
 
     def forward(self, directions: Float[Tensor, "height width 3"]) -> Float[Tensor, "height width 6"]:
         """Bilinear lookup for unit world directions; longitude wraps around, the poles are the y axis."""
-        x, y, z = directions.unbind(-1)
-        columns = self.features.shape[2]
-        # One column more on either side, so that the seam is interpolated too.
-        padded = torch.nn.functional.pad(self.features[None], (1, 1, 0, 0), mode="circular")
-        longitude = torch.atan2(x, z) / math.pi * columns / (columns + 2)
-        latitude = torch.asin(y.clamp(-1, 1)) / (math.pi / 2)
-        grid = torch.stack([longitude, latitude], -1)[None]
-        sampled = torch.nn.functional.grid_sample(padded, grid, padding_mode="border", align_corners=False)
-        return sampled[0].permute(1, 2, 0)
+        x, y, z = directions.flatten(0, 1).unbind(1)
+        height, width, channels = self.features.shape
+        column = (torch.atan2(x, z) / math.pi + 1) / 2 * width - 0.5
+        row = ((torch.asin(y.clamp(-1, 1)) / (math.pi / 2) + 1) / 2 * height - 0.5).clamp(0, height - 1)
+        left, top = column.detach().floor(), row.detach().floor()
+        right_share, lower_share = column - left, row - top
+        columns = torch.stack([left, left + 1], 1).long() % width
+        rows = torch.stack([top, top + 1], 1).long().clamp(max=height - 1)
+        shares = (
+            torch.stack([1 - lower_share, lower_share], 1)[:, :, None]
+            * torch.stack([1 - right_share, right_share], 1)[:, None, :]
+        )
+        texel = rows[:, :, None] * width + columns[:, None, :]
+        # Reads rows of the table: a map of its size is never copied.
+        found = self.features.view(-1, channels).index_select(0, texel.flatten()).view(-1, 4, channels)
+        return (shares.view(-1, 4, 1) * found).sum(1).view(*directions.shape[:2], channels)

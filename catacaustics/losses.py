@@ -18,19 +18,26 @@ def ssim_map(
     window, the window shrinks to the image.
     """
     size = min(_WINDOW, *image.shape[:2])
-    offset = torch.arange(size, dtype=image.dtype, device=image.device) - (size - 1) / 2
-    kernel = torch.exp(-(offset**2) / (2 * _SIGMA**2))
-    kernel = kernel / kernel.sum()
     x, y = image.permute(2, 0, 1), target.permute(2, 0, 1)
-    stack = torch.cat([x, y, x * x, y * y, x * y])[:, None]
-    blurred = torch.nn.functional.conv2d(stack, kernel[None, None, :, None])
-    blurred = torch.nn.functional.conv2d(blurred, kernel[None, None, None, :])
-    mx, my, xx, yy, xy = blurred[:, 0].view(5, -1, *blurred.shape[2:])
+    stack = torch.stack([x, y, x * x, y * y, x * y])
+    rows, columns = (_blur_matrix(n, size, image) for n in image.shape[:2])
+    mx, my, xx, yy, xy = rows @ (stack @ columns.T)
     c1, c2 = 0.01**2, 0.03**2
     covariance = xy - mx * my
     variances = (xx - mx * mx) + (yy - my * my)
     value = (2 * mx * my + c1) * (2 * covariance + c2) / ((mx * mx + my * my + c1) * (variances + c2))
     return value.permute(1, 2, 0)
+
+
+def _blur_matrix(length: int, size: int, like: Tensor) -> Tensor:
+    """The window along one axis as a banded matrix (length - size + 1, length): several times as fast, with its
+    gradient, as a convolution of single channels."""
+    offset = torch.arange(size, dtype=like.dtype, device=like.device) - (size - 1) / 2
+    kernel = torch.exp(-(offset**2) / (2 * _SIGMA**2))
+    count = length - size + 1
+    matrix = like.new_zeros(count, length)
+    matrix.as_strided((count, size), (length + 1, 1)).copy_(kernel / kernel.sum())
+    return matrix
 
 
 def dssim(

@@ -10,7 +10,7 @@ FEATURES = 6
 
 
 class _ResidualBlock(nn.Module):
-    """x + scale W2 relu(W1 x + b1) + b2 with FixUp initialisation (Zhang et al. 2019): W2 starts at zero."""
+    """x + scale (W2 relu(W1 x + b1) + b2) with FixUp initialisation (Zhang et al. 2019): W2 starts at zero."""
 
     def __init__(self, width: int, blocks: int):
         super().__init__()
@@ -25,8 +25,9 @@ class _ResidualBlock(nn.Module):
         nn.init.zeros_(self.second.bias)
 
     def forward(self, x: Tensor) -> Tensor:
-        # In place and fused: these layers are bound by memory traffic, not by arithmetic.
-        return torch.addcmul(x, self.scale, self.second(self.first(x).relu_()))
+        # In place, and the scale in the small matrix: these layers are bound by memory traffic, not by arithmetic.
+        hidden = self.first(x).relu_()
+        return torch.addmm(x, hidden, (self.scale * self.second.weight).T).add_(self.scale * self.second.bias)
 
 
 class ResidualMLP(nn.Module):
@@ -39,7 +40,7 @@ class ResidualMLP(nn.Module):
         self.blocks = nn.Sequential(*(_ResidualBlock(width, blocks) for _ in range(blocks)))
 
     def forward(self, x: Tensor) -> Tensor:
-        return torch.relu(self.blocks(self.input(x).relu_()))
+        return self.blocks(self.input(x).relu_()).relu_()
 
 
 class NeuralRenderer(nn.Module):
@@ -65,7 +66,7 @@ class NeuralRenderer(nn.Module):
         directions: Float[Tensor, "height width 3"],
     ) -> Float[Tensor, "height width 3"]:
         """Decode features, already weighted by 1 - rho and rho, and unit view directions to RGB (not clamped)."""
-        code = torch.cat(
-            [self.primary_encoder(torch.cat([primary, directions], -1)), self.reflection_encoder(reflection)], -1
-        )
-        return primary[..., :3] + reflection[..., :3] + self.head(self.decoder(code))
+        # A list of pixels: in-place steps on views of it would be copied by autograd.
+        seen = torch.cat([primary, directions], -1).flatten(0, 1)
+        code = torch.cat([self.primary_encoder(seen), self.reflection_encoder(reflection.flatten(0, 1))], -1)
+        return primary[..., :3] + reflection[..., :3] + self.head(self.decoder(code)).view_as(directions)

@@ -26,7 +26,7 @@ from catacaustics.renderer import FEATURES, NeuralRenderer
 from catacaustics.shapes import Float, Int
 from catacaustics.splatting import SplatOutput, points_in_view, splat_points
 
-FORMAT = 1
+FORMAT = 2
 
 WarpCamera = Camera | Sequence[Camera | None] | None
 """The camera that reflections follow instead of the view's own: one for all reflectors, or one for each (None: the
@@ -379,7 +379,7 @@ def _from_state(state: dict[str, Tensor], volumes: list[ReflectionVolume], splat
     ]
     environment = None
     if "environment.features" in state:
-        _, height, width = state["environment.features"].shape
+        height, width, _ = state["environment.features"].shape
         environment = EnvironmentMap(width, height)
     blocks = {k.split(".")[3] for k in state if k.startswith("renderer.decoder.blocks.")}
     renderer = NeuralRenderer(len(state["renderer.decoder.input.bias"]), 1 + 2 * len(blocks))

@@ -58,7 +58,7 @@ def test_the_environment_map_returns_what_is_stored_in_a_direction():
         longitude = (column + 0.5) / 16 * 2 * math.pi - math.pi
         latitude = (row + 0.5) / 8 * math.pi - math.pi / 2
         found = environment(direction(longitude, latitude))[0, 0]
-        torch.testing.assert_close(found, environment.features[:, row, column], atol=2e-5, rtol=1e-5)
+        torch.testing.assert_close(found, environment.features[row, column], atol=2e-5, rtol=1e-5)
 
 
 def test_the_environment_map_has_no_seam():
@@ -67,9 +67,9 @@ def test_the_environment_map_has_no_seam():
         environment.features.copy_(torch.randn_like(environment.features))
     left, right = (environment(direction(s * (math.pi - 1e-5), 0.2)) for s in (-1, 1))
     torch.testing.assert_close(left, right, atol=1e-3, rtol=0)
-    between = (environment.features[:, :, 0] + environment.features[:, :, -1]) / 2
+    between = (environment.features[:, 0] + environment.features[:, -1]) / 2
     latitude = 0.5 / 8 * math.pi
-    torch.testing.assert_close(environment(direction(math.pi, latitude))[0, 0], between[:, 4], atol=2e-5, rtol=1e-5)
+    torch.testing.assert_close(environment(direction(math.pi, latitude))[0, 0], between[4], atol=2e-5, rtol=1e-5)
 
 
 def test_a_static_warp_moves_nothing_and_a_neural_warp_starts_almost_still():

@@ -59,17 +59,20 @@ def sphere_angle(
         ends = _paraxial_bracket(camera[inside], source[inside], between[inside], radius)
         low[inside], high[inside] = ends
     angle = (low + high) / 2
+    tolerance = 16 * torch.finfo(between.dtype).eps
     for _ in range(_ITERATIONS):
         value_c, slope_c = _incidence(camera, angle, radius)
         value_p, slope_p = _incidence(source, between - angle, radius)
         value, slope = value_c - value_p, slope_c + slope_p
         low, high = torch.where(value < 0, angle, low), torch.where(value < 0, high, angle)
         newton = angle - value / torch.where(slope.abs() < 1e-12, 1e-12, slope)
+        # A root that is found sits on an end of its bracket; rounding alone would send it to the middle again.
+        found = (newton - angle).abs() < tolerance
         enclosed = (newton - low) * (newton - high) < 0
-        following = torch.where(enclosed, newton, (low + high) / 2)
+        following = torch.where(enclosed, newton, torch.where(found, angle, (low + high) / 2))
         done = (following - angle).abs().max() if angle.numel() else angle.new_zeros(())
         angle = following
-        if done < 16 * torch.finfo(angle.dtype).eps:
+        if done < tolerance:
             break
     return angle
 

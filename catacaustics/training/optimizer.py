@@ -49,8 +49,8 @@ class RowAdam(torch.optim.Optimizer):
     """Adam (Kingma and Ba 2015), decoupled weight decay; in groups with `rows`, rows without a gradient stand still.
 
     Args:
-        groups: one parameter each, with name, lr, weight_decay and rows; where a group has `row_rates` (n,), they
-            multiply the learning rate of each row.
+        groups: one parameter each, with name, lr, weight_decay and rows, the number of leading axes that count rows
+            (0: none); where a group has `row_rates` (n,), they multiply the learning rate of each row.
         betas, eps: as in Adam.
     """
 
@@ -65,17 +65,21 @@ class RowAdam(torch.optim.Optimizer):
                 continue
             state = self.state[parameter]
             if not state:
-                count = len(parameter) if group["rows"] else 1
+                count = math.prod(parameter.shape[: group["rows"]])
                 state["step"] = torch.zeros(count, device=parameter.device)
                 state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
             if group["rows"]:
-                seen = torch.nonzero(parameter.grad.reshape(len(parameter), -1).any(1))[:, 0]
-                tensors = (parameter, parameter.grad, *(state[k] for k in ("step", "exp_avg", "exp_avg_sq")))
+                moments = (state["exp_avg"], state["exp_avg_sq"])
+                value, gradient, mean, square = (
+                    t.flatten(0, group["rows"] - 1) for t in (parameter, parameter.grad, *moments)
+                )
+                seen = torch.nonzero(gradient.view(len(gradient), -1).any(1))[:, 0]
+                tensors = (value, gradient, state["step"], mean, square)
                 rows = [t.index_select(0, seen) for t in tensors]
                 scale = group["row_rates"]
                 _adam(*rows, group, 1.0 if scale is None else scale.index_select(0, seen))
                 for whole, part in zip(tensors, rows, strict=True):
-                    if whole is not parameter.grad:
+                    if whole is not gradient:
                         whole.index_copy_(0, seen, part)
             else:
                 _adam(parameter, parameter.grad, state["step"], state["exp_avg"], state["exp_avg_sq"], group)
@@ -112,7 +116,7 @@ def make_optimizer(scene: Scene, config: TrainConfig, corrections: Corrections |
             "name": name,
             "lr": 0.0,
             "weight_decay": config.warp_weight_decay if ".network." in name else 0.0,
-            "rows": name.startswith(("primary.", "reflections.", "corrections.")),
+            "rows": _row_axes(name),
             "row_rates": _source_distances(scene, name),
         }
         for name, parameter in named
@@ -120,6 +124,11 @@ def make_optimizer(scene: Scene, config: TrainConfig, corrections: Corrections |
     ]
     # Losses are weighted by 0.05 and spread over thousands of points: gradients are far below Adam's default eps.
     return RowAdam(groups, eps=1e-15)
+
+
+def _row_axes(name: str) -> int:
+    """Points and photographs are rows, and so are the texels of the environment map."""
+    return 2 if name.startswith("environment.") else int(name.startswith(("primary.", "reflections.", "corrections.")))
 
 
 def _source_distances(scene: Scene, name: str) -> Tensor | None:
@@ -153,7 +162,7 @@ def append_rows(optimizer: RowAdam, module: nn.Module, prefix: str, rows: dict[s
         setattr(module, attribute, grown)
 
 
-def optimizer_tensors(optimizer: RowAdam) -> dict[str, Tensor]:
+def optimizer_tensors(optimizer: torch.optim.Optimizer) -> dict[str, Tensor]:
     """The moments as named tensors, for the checkpoint."""
     return {
         f"adam.{group['name']}.{key}": value
@@ -162,7 +171,7 @@ def optimizer_tensors(optimizer: RowAdam) -> dict[str, Tensor]:
     }
 
 
-def restore_optimizer(optimizer: RowAdam, tensors: dict[str, Tensor]) -> None:
+def restore_optimizer(optimizer: torch.optim.Optimizer, tensors: dict[str, Tensor]) -> None:
     for group in optimizer.param_groups:
         parameter = group["params"][0]
         state = {k: tensors.get(f"adam.{group['name']}.{k}") for k in ("step", "exp_avg", "exp_avg_sq")}
