@@ -13,3 +13,7 @@ class UserError(Exception):
     def __init__(self, found: str, expected: str, remedy: str):
         self.found, self.expected, self.remedy = found, expected, remedy
         super().__init__(f"{found}\n  expected: {expected}\n  what to do: {remedy}")
+
+    def __reduce__(self) -> tuple[type["UserError"], tuple[str, str, str]]:
+        """Processes hand it on."""
+        return type(self), (self.found, self.expected, self.remedy)

@@ -14,6 +14,7 @@ from catacaustics.capture.dataset import open_capture
 from catacaustics.capture.truth import read_truth
 from catacaustics.errors import UserError
 from catacaustics.images import read_image
+from catacaustics.refraction.variants import choose_variant
 
 TOOLS = Path(__file__).parents[1] / "tools"
 sys.path.insert(0, str(TOOLS))
@@ -22,7 +23,7 @@ from make_scene import MakeScene, check_camera, main, make_scene  # noqa: E402
 from scene_maker.cameras import camera_at  # noqa: E402
 from scene_maker.catalogue import SCENES  # noqa: E402
 from scene_maker.model import Light, Reflector, SceneModel  # noqa: E402
-from scene_maker.render import Renderer, choose_variant  # noqa: E402
+from scene_maker.render import Renderer  # noqa: E402
 from scene_maker.solids import box, panel, sheet  # noqa: E402
 
 pytest.importorskip("mitsuba")
@@ -210,7 +211,7 @@ def without_llvm(code: str) -> subprocess.CompletedProcess:
 
 
 def test_a_missing_llvm_library_is_named():
-    done = without_llvm("from scene_maker.render import choose_variant; choose_variant('llvm_ad_rgb')")
+    done = without_llvm("from catacaustics.refraction.variants import choose_variant; choose_variant('llvm_ad_rgb')")
     assert "UserError" in done.stderr
     assert "libllvm" in done.stderr
 
@@ -218,7 +219,8 @@ def test_a_missing_llvm_library_is_named():
 def test_without_llvm_the_scalar_renderer_traces_the_same_geometry_and_says_that_it_is_slow():
     done = without_llvm(
         "import numpy as np\n"
-        "from scene_maker.render import Renderer, choose_variant\n"
+        "from scene_maker.render import Renderer\n"
+        "from catacaustics.refraction.variants import choose_variant\n"
         "from scene_maker.cameras import camera_at\n"
         "from scene_maker.model import Reflector, SceneModel\n"
         "from scene_maker.solids import panel\n"

@@ -18,7 +18,7 @@ import tyro
 from scene_maker.cameras import HandHeld, held_out_cameras
 from scene_maker.catalogue import build
 from scene_maker.model import SceneModel
-from scene_maker.render import Renderer, choose_variant
+from scene_maker.render import Renderer
 from scene_maker.solids import ply_bytes
 from tqdm import tqdm
 
@@ -29,6 +29,7 @@ from catacaustics.errors import UserError
 from catacaustics.files import read_json, write_bytes, write_json
 from catacaustics.geometry import sphere_directions
 from catacaustics.images import write_image
+from catacaustics.refraction.variants import choose_variant
 
 CLEARANCE = 0.15
 """Free space that every camera needs around it, in metres."""

@@ -183,13 +183,16 @@ def shard_problem(path: Path, sha256: str | None) -> str | None:
     if not path.is_file():
         return "is missing"
     if sha256 is not None:
-        same = hashlib.sha256(path.read_bytes()).hexdigest() == sha256
-        return None if same else "is corrupt: its checksum differs from the one in card.json"
+        return None if sha256_of(path) == sha256 else "is corrupt: its checksum differs from the one in card.json"
     try:
         with zipfile.ZipFile(path) as file:
             return None if file.testzip() is None else "is corrupt"
     except zipfile.BadZipFile:
         return "is corrupt"
+
+
+def sha256_of(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def read_frame(path: Path, index: int) -> Frame:

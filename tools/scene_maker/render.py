@@ -4,7 +4,6 @@ Mitsuba's cameras look along +z with x to the left and y up; ours have x to the 
 world_from_mitsuba = world_from_camera @ diag(-1, -1, 1, 1). Pixel centres are at +0.5 in both.
 """
 
-import sys
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,61 +11,18 @@ import numpy as np
 
 from catacaustics.cameras import Camera, pixel_centers
 from catacaustics.capture.truth import Truth
-from catacaustics.errors import UserError
 from catacaustics.geometry import rigid_inverse
 from catacaustics.images import resize
 from catacaustics.shapes import Bool, Float, Int
 from scene_maker.model import Light, Reflector, SceneModel
 from scene_maker.solids import DENSITY, Mesh, Surface, atlas, merged, sheet
 
-VARIANTS = ("auto", "cuda_ad_rgb", "llvm_ad_rgb", "scalar_rgb")
 MAX_BOUNCES = 12
 LIGHT_CELL = 4
 """Side in texels of the cells for which light is path-traced: 1 to 2 cm."""
 SAMPLES_AT_ONCE = 4
 BLACK = {"type": "conductor", "specular_reflectance": {"type": "rgb", "value": 0.0}}
 """What emits and reflects nothing: a mirror rather than a diffuse surface, so that no light is sampled in vain."""
-OLDEST_LLVM = 17
-"""Older ones end the whole process on some processors: "Cannot select fminimum"."""
-_LLVM_REMEDY = (
-    f"install the library of LLVM {OLDEST_LLVM} or newer (Debian, Ubuntu: `apt-get install -y libllvm19`), "
-    "or use --variant scalar_rgb"
-)
-
-
-def choose_variant(variant: str = "auto") -> str:
-    """Start Mitsuba with a variant and return its name; `auto` takes the first of CUDA, LLVM and scalar that works.
-
-    Raises:
-        UserError: Mitsuba is missing, or the variant asked for does not work here.
-    """
-    if variant not in VARIANTS:
-        raise UserError(f"There is no variant {variant}.", f"one of {', '.join(VARIANTS)}", "name one of them")
-    try:
-        import drjit as dr
-        import mitsuba as mi
-    except ImportError as error:
-        raise UserError(
-            "Mitsuba is not installed.", "the Python package mitsuba", "pip install 'catacaustics[scenes]'"
-        ) from error
-    problems = []
-    for name in VARIANTS[1:] if variant == "auto" else (variant,):
-        try:
-            mi.set_variant(name)
-            np.array(mi.Float(1.0) + 1.0)  # the compiler or driver is looked for only now
-            if name == "llvm_ad_rgb" and (version := dr.detail.llvm_version())[0] < OLDEST_LLVM:
-                raise RuntimeError(f"LLVM {version[0]} is too old")
-        except (RuntimeError, ImportError) as error:
-            problems.append(f"{name}: {str(error).strip().splitlines()[-1]}")
-            continue
-        if name == "scalar_rgb" and variant == "auto":
-            print(
-                f"No usable LLVM library: rendering with scalar_rgb, which is slow. To go faster, {_LLVM_REMEDY}.",
-                file=sys.stderr,
-            )
-        return name
-    remedy = _LLVM_REMEDY if "llvm" in variant else "use --variant auto"
-    raise UserError(f"Mitsuba cannot start {'; '.join(problems)}.", "a working Mitsuba variant", remedy)
 
 
 def _scalar() -> bool:
