@@ -17,7 +17,7 @@ from catacaustics.config import AblateConfig, TrainConfig
 from catacaustics.errors import UserError
 from catacaustics.files import read_json, write_json, write_text
 from catacaustics.metrics import psnr
-from catacaustics.page import html_page
+from catacaustics.page import figure_svg, html_page
 from catacaustics.reflectors.volume import ReflectionVolume, build_volume
 from catacaustics.scene import Scene
 from catacaustics.training.initialize import named_reflectors, usual_points
@@ -230,9 +230,6 @@ def _page(capture: Capture, config: AblateConfig, results: list[dict[str, Any]])
 
 def chart(results: list[dict[str, Any]]) -> str:
     """PSNR inside the reflector against training seconds as SVG, a line a row (equal-time rows where there are any)."""
-    import io
-
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
     from matplotlib.figure import Figure
 
     budgets = list(dict.fromkeys(r["budget"] for r in results))
@@ -255,7 +252,4 @@ def chart(results: list[dict[str, Any]]) -> str:
     axes.set_xlim(left=0)
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
-    buffer = io.StringIO()
-    FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None})
-    text = buffer.getvalue()
-    return text[text.index("<svg") :]
+    return figure_svg(figure)

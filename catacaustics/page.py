@@ -1,6 +1,8 @@
 """The frame of every HTML page that a run writes: one style, no links outside."""
 
+from io import StringIO
 from pathlib import Path
+from typing import Any
 
 
 def html_page(title: str, body: str, style: str = "", after: str = "") -> str:
@@ -18,3 +20,13 @@ def html_page(title: str, body: str, style: str = "", after: str = "") -> str:
         f'<meta name="color-scheme" content="light dark"><style>\n{css}{style}</style></head>\n<body><main>'
         f"{body}</main>{after}</body></html>\n"
     )
+
+
+def figure_svg(figure: Any) -> str:
+    """A matplotlib Figure as inline SVG."""
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+
+    buffer = StringIO()
+    FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None})
+    text = buffer.getvalue()
+    return text[text.index("<svg") :]

@@ -209,14 +209,14 @@ def _article(name: str, row: dict[str, Any], frame: Frame, view: View, flip: np.
     """A frame's pictures side by side."""
     strip = legend_html(ERROR_COLORMAP, "0", "1")
     pictures = [
-        _enlarged("Path traced", frame.reference),
-        _enlarged("Model", view.image),
-        _enlarged(f"Error (FLIP, glass outlined) {strip}", error_image(flip, frame.refractive)),
-        _enlarged("Direct light, no glass", frame.direct),
-        _enlarged("True colour at the landing points", view.true_color),
+        enlarged("Path traced", frame.reference),
+        enlarged("Model", view.image),
+        enlarged(f"Error (FLIP, glass outlined) {strip}", error_image(flip, frame.refractive)),
+        enlarged("Direct light, no glass", frame.direct),
+        enlarged("True colour at the landing points", view.true_color),
     ]
     if view.looked_up is not None:
-        pictures.append(_enlarged("Colour looked up", view.looked_up))
+        pictures.append(enlarged("Colour looked up", view.looked_up))
     numbers = " ".join(
         f"<span>{key} <b>{row[key]:.4f}</b></span>" for key in ("T.L1", "T.SSIM", "R.L1", "L1") if key in row
     )
@@ -225,7 +225,7 @@ def _article(name: str, row: dict[str, Any], frame: Frame, view: View, flip: np.
     return f'<article>{head}<div class="grid three">{grid}</div></article>'
 
 
-def _enlarged(caption: str, image: np.ndarray) -> Picture:
+def enlarged(caption: str, image: np.ndarray) -> Picture:
     """Small images with their pixels doubled or more, so that the browser does not blur them."""
     times = max(1, 384 // max(image.shape[:2]))
     return encode_picture(caption, np.repeat(np.repeat(image, times, 0), times, 1))
@@ -249,7 +249,7 @@ def _page(run: Path, result: dict[str, Any], articles: list[str]) -> str:
     hint = "Click a picture to enlarge it and compare it with the path-traced one."
     rows = "".join(
         f'<tr><th scope="row">{escape(k)}</th><td>{v["pixels"]:,}</td><td>{v["T.L1"]:.4f}</td>'
-        f"<td>{_optional(v.get('R.L1'))}</td></tr>"
+        f"<td>{optional(v.get('R.L1'))}</td></tr>"
         for k, v in result["regions"].items()
     )
     regions = (
@@ -269,5 +269,5 @@ def _page(run: Path, result: dict[str, Any], articles: list[str]) -> str:
     return zoom_page(f"{name}: refraction", "\n".join(body), style="img { image-rendering: pixelated; }")
 
 
-def _optional(value: float | None) -> str:
+def optional(value: float | None) -> str:
     return "–" if value is None else f"{value:.4f}"
