@@ -224,10 +224,12 @@ def _solve(sources: Tensor, camera: Tensor, center: Tensor, axes: Tensor, concav
         return u
     # Newton's method doubles the digits: the last, differentiated step reaches the rest.
     tolerance = torch.finfo(u.dtype).eps ** 0.6
+    active = torch.arange(len(u), device=u.device)
     for _ in range(_ITERATIONS // 2):
-        path, basis = _path(u, sources, camera, center, axes), _tangents(u)
+        here = u[active]
+        path, basis = _path(here, sources[active], camera, center, axes), _tangents(here)
         gradient = torch.einsum("nij,ni->nj", basis, _gradient(path, axes))
-        hessian = _hessian(path, u, basis, axes)
+        hessian = _hessian(path, here, basis, axes)
         if not concave:
             # L has a minimum: where it is not convex yet, add to the diagonal until it is.
             middle = (hessian[:, 0, 0] + hessian[:, 1, 1]) / 2
@@ -235,8 +237,9 @@ def _solve(sources: Tensor, camera: Tensor, center: Tensor, axes: Tensor, concav
             lift = (1e-3 * (middle.abs() + spread) - (middle - spread)).clamp_min(0)
             hessian.diagonal(dim1=1, dim2=2).add_(lift[:, None])
         step = _shortened(_solve2(hessian, gradient), _MAX_STEP)
-        u = torch.nn.functional.normalize(u - torch.einsum("nij,nj->ni", basis, step), dim=1)
-        if float(step.abs().max() if step.numel() else 0) < tolerance:
+        u[active] = torch.nn.functional.normalize(here - torch.einsum("nij,nj->ni", basis, step), dim=1)
+        active = active[step.abs().amax(1) >= tolerance]
+        if not len(active):
             break
     return u
 
