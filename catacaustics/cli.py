@@ -18,7 +18,13 @@ _COMMANDS = {
     "render": ("catacaustics.video", "render_video", "RenderConfig"),
     "edit": ("catacaustics.editing", "edit", "EditConfig"),
     "clone": ("catacaustics.editing", "clone", "CloneConfig"),
+    "stereo": ("catacaustics.stereo", "stereo", "StereoConfig"),
+    "track": ("catacaustics.tracking", "track", "TrackConfig"),
+    "export": ("catacaustics.export", "export", "ExportConfig"),
     "refract data": ("catacaustics.refraction.data", "make_data", "RefractDataConfig"),
+    "refract train": ("catacaustics.refraction.train", "train", "RefractTrainConfig"),
+    "refract evaluate": ("catacaustics.refraction.evaluate", "evaluate", "RefractEvaluateConfig"),
+    "refract report": ("catacaustics.refraction.report", "report", "RefractReportConfig"),
     "doctor": ("catacaustics.doctor", "doctor", "DoctorConfig"),
 }
 

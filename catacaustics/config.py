@@ -274,6 +274,91 @@ class CloneConfig:
 
 
 @dataclass(frozen=True)
+class StereoConfig:
+    """Stereo pictures of a scene, with comfortable reflections on request; writes them into a folder."""
+
+    run: Path
+    """Folder that training wrote."""
+    out: Path
+    """Folder to write: left.png, right.png, anaglyph.png, side_by_side.png, stereo.json, film.mp4."""
+    warp_separation: float = 1.0
+    """The reflections' share of the eye separation: 1 is physically right, 0 the most comfortable."""
+    separation: float | None = None
+    """Between the eyes, in world units; left out, a thirtieth of the distance to the screen."""
+    screen: float | None = None
+    """Distance of what has no disparity; left out, of the front of the nearest reflector."""
+    view: str | None = None
+    """The photograph whose camera stands between the eyes; left out, the first held-out one."""
+    film: Literal["side-by-side", "anaglyph"] | None = None
+    """Also write film.mp4 along the path."""
+    path: CameraPath = "held-out"
+    """Of the film, as in `catacaustics render`."""
+    seconds: float = 10.0
+    fps: float = 24.0
+    width: int = 800
+    """Width of one eye's picture in pixels."""
+    quality: int = 20
+    """Constant rate factor of H.264: lower is better and larger."""
+    capture: Path | None = None
+    """The capture, where it is no longer at the place that training noted."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+
+
+@dataclass(frozen=True)
+class TrackConfig:
+    """Follow reflected points from view to view: pixel tracks as CSV and JSON, a picture and a film with dots."""
+
+    run: Path
+    """Folder that training wrote."""
+    out: Path
+    """Folder to write: tracks.csv, tracks.json, tracks.jpg, tracks.mp4."""
+    view: str | None = None
+    """The photograph in whose view points are chosen; left out, the first held-out one."""
+    pixels: tuple[float, ...] = ()
+    """Follow what is reflected at these pixels of the view at `width`: X Y X Y ..."""
+    points: tuple[int, ...] = ()
+    """Follow these points of the reflection cloud."""
+    count: int = 12
+    """Where neither is given: this many points, spread over the reflector."""
+    reflector: str | None = None
+    """Name of the reflector, where there are several."""
+    least_weight: float = 0.05
+    """A point is visible where it has at least this share of the pixel at its middle."""
+    truth: Path | None = None
+    """The path-traced capture with truth/, where the run's capture is a copy without; errors are then measured."""
+    film: bool = True
+    """Write the film too."""
+    path: CameraPath = "held-out"
+    """The views to follow the points in, as in `catacaustics render`."""
+    seconds: float = 5.0
+    fps: float = 24.0
+    width: int = 480
+    """Width of the views in pixels."""
+    quality: int = 20
+    """Constant rate factor of H.264: lower is better and larger."""
+    capture: Path | None = None
+    """The capture, where it is no longer at the place that training noted."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+
+
+@dataclass(frozen=True)
+class ExportConfig:
+    """Take a scene elsewhere: clouds, 3D Gaussians, mirrors and volumes as PLY, cameras as COLMAP and JSON."""
+
+    run: Path
+    """Folder that training wrote."""
+    out: Path
+    """Folder to write."""
+    view: str | None = None
+    """Colours are as seen from this photograph's camera; left out, from the first held-out one."""
+    photographs: bool = False
+    """Copy the photographs into OUT/images; otherwise the cameras' files refer to the capture's."""
+    capture: Path | None = None
+    """The capture, where it is no longer at the place that training noted."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+
+
+@dataclass(frozen=True)
 class ReconstructConfig:
     """Photographs in, a trained scene with its report out: calibrate, train and evaluate in one go.
 
@@ -439,6 +524,33 @@ class RefractEvaluateConfig:
     split: Literal["test", "val", "train"] = "test"
     shown_frames: int = 8
     """Frames with pictures in the report, spread over the split."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+
+
+@dataclass(frozen=True)
+class RefractReportConfig:
+    """Train refraction models for equal seconds with several seeds and compare them: table, chart, pictures.
+
+    Run the same command again after an interruption: finished trainings are kept.
+    """
+
+    data: Path
+    """Folder made by `catacaustics refract data`."""
+    out: Path
+    """Folder to write: report.html, comparison.json, table.md and the trained models, runs/MODEL_SIZE_SEED."""
+    models: tuple[RefractModel, ...] = ("glassnet", "crystalnet", "ssnrb", "direct", "hybrid")
+    sizes: tuple[Literal["small", "base", "paper"], ...] = ("small",)
+    """Of the networks; with several, the chart of speed against error has a line a model."""
+    seeds: tuple[int, ...] = (0, 1, 2)
+    minutes: float = 20.0
+    """Training time of each model, generator and renderer together."""
+    generator_share: float = 0.5
+    """Of the minutes; a model without generator gives them all to its renderer."""
+    clock: Literal["wall", "cpu"] = "wall"
+    """What minutes are measured by; cpu: processor time of this process, fair where others use the machine too."""
+    split: Literal["test", "val", "train"] = "test"
+    shown_frames: int = 6
+    """Frames with pictures of all models."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from catacaustics.errors import UserError
 from catacaustics.files import write_bytes
-from catacaustics.shapes import Float
+from catacaustics.shapes import Float, Int
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,16 +29,31 @@ class PointCloud:
 
 def write_ply(path: Path, cloud: PointCloud) -> None:
     """Write binary PLY with x y z nx ny nz (float32) and red green blue (8 bits)."""
-    from plyfile import PlyData, PlyElement
-
     types = [(name, "f4") for name in ("x", "y", "z", "nx", "ny", "nz")] + [(n, "u1") for n in ("red", "green", "blue")]
     table = np.empty(len(cloud), types)
     for i, axis in enumerate("xyz"):
         table[axis], table["n" + axis] = cloud.positions[:, i], cloud.normals[:, i]
     for i, channel in enumerate(("red", "green", "blue")):
         table[channel] = np.clip(cloud.colors[:, i], 0, 1) * 255 + 0.5
+    write_tables(path, vertex=table)
+
+
+def write_mesh(path: Path, vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> None:
+    """Write a triangle mesh as binary PLY."""
+    corners = np.empty(len(vertices), [(axis, "f4") for axis in "xyz"])
+    for i, axis in enumerate("xyz"):
+        corners[axis] = vertices[:, i]
+    triangles = np.empty(len(faces), [("vertex_indices", "i4", (3,))])
+    triangles["vertex_indices"] = faces
+    write_tables(path, vertex=corners, face=triangles)
+
+
+def write_tables(path: Path, **elements: np.ndarray) -> None:
+    """Write a binary PLY file of structured arrays, one an element."""
+    from plyfile import PlyData, PlyElement
+
     buffer = io.BytesIO()
-    PlyData([PlyElement.describe(table, "vertex")]).write(buffer)
+    PlyData([PlyElement.describe(table, name) for name, table in elements.items()]).write(buffer)
     write_bytes(path, buffer.getvalue())
 
 

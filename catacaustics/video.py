@@ -40,7 +40,8 @@ def render_video(config: RenderConfig) -> Path:
         output = run.scene.render(cameras[i], warp_camera=warps[i])
         return np.concatenate([layer_image(output, layer, depths) for layer in config.layers], 1)
 
-    key = film_key(run.folder, cameras, config.layers, config.warp_offset, config.warp_path, config.warp_reflector)
+    settings = config.layers, config.warp_offset, config.warp_path, config.warp_reflector
+    key = film_key(scene_file(run.folder).read_bytes(), cameras, *settings)
     return write_film(config.video, frames, draw, key, config.fps, config.quality)
 
 
@@ -76,10 +77,10 @@ def write_film(
     return video
 
 
-def film_key(folder: Path, cameras: Sequence[Camera], *settings: object) -> str:
-    """A name for everything that a film's frames depend on: the scene's file, the cameras, and settings by their
-    `repr`."""
-    digest = hashlib.sha256(scene_file(folder, unfinished=True).read_bytes())
+def film_key(state: bytes, cameras: Sequence[Camera], *settings: object) -> str:
+    """A name for everything that a film's frames depend on: the scene (its file's content), the cameras, and settings
+    by their `repr`."""
+    digest = hashlib.sha256(state)
     digest.update(repr((catacaustics.__version__, len(cameras), *settings)).encode())
     for c in cameras:
         digest.update(repr((c.width, c.height, c.fx, c.fy, c.cx, c.cy)).encode() + c.camera_from_world.tobytes())

@@ -1,16 +1,15 @@
 """Edits leave what they do not touch, and move what they do as they say."""
 
-import functools
+import copy
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from toy import make_toy_capture
+from toy import make_toy_capture, scene_of, write_run
 
 from catacaustics import cli
 from catacaustics.capture.dataset import open_capture
-from catacaustics.config import TrainConfig
 from catacaustics.editing import (
     adjust_reflections,
     clone_reflector,
@@ -19,36 +18,14 @@ from catacaustics.editing import (
     replace_surroundings,
 )
 from catacaustics.errors import UserError
-from catacaustics.files import write_json
-from catacaustics.reflectors.volume import build_volume
+from catacaustics.geometry import sphere_directions
+from catacaustics.reflectors.warps import QuadricWarp
 from catacaustics.scene import Scene
-from catacaustics.training.initialize import initial_scene, named_reflectors, primary_seeds, reflection_seeds
 
 
 @pytest.fixture(scope="module")
 def capture(tmp_path_factory):
     return open_capture(make_toy_capture(tmp_path_factory.mktemp("editing")))
-
-
-@functools.cache  # edits leave scenes as they are
-def scene_of(capture, model):
-    config = TrainConfig(
-        capture.root,
-        capture.root / "run",
-        model=(model,),
-        primary_points=6000,
-        reflection_points=800,
-        environment_width=20,
-        warp_width=16,
-    )
-    reflectors = named_reflectors([build_volume(capture, "ball")], config.model)
-    rng = np.random.default_rng(0)
-    seeds = [primary_seeds(capture, reflectors, config, rng), reflection_seeds(capture, reflectors[0], config, rng)]
-    scene = initial_scene(capture, reflectors, seeds, 1.0, config)
-    with torch.no_grad():
-        scene.primary.opacity_logits.fill_(8.0)  # opaque, so that nothing shines through
-        scene.reflections[0].features[:, :3] = torch.rand(800, 3, generator=torch.Generator().manual_seed(0))
-    return scene
 
 
 @pytest.fixture(scope="module")
@@ -133,7 +110,10 @@ def test_a_box_chooses_what_is_copied_along(capture, ball):
 @pytest.mark.parametrize("model", ["sphere", "ellipsoid", "plane"])
 def test_a_clone_in_resting_surroundings_obeys_fermat_at_its_new_place(capture, model):
     """Where a point is displayed, the light's path from it over the mirror is the shortest, by brute force."""
-    scene = scene_of(capture, model)
+    scene = copy.deepcopy(scene_of(capture, "plane" if model == "plane" else "sphere"))
+    if model == "ellipsoid":
+        middle, axes = (t.detach() for t in scene.warps[0].shape())
+        scene.warps[0] = QuadricWarp(middle, axes * torch.tensor([1.2, 0.9, 0.8]), sphere=False)
     turn = np.array([[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1.0]])
     shift = np.array([0.4, -0.1, 0.2])
     cloned = clone_reflector(scene, 0, shift, turn, 0.7, resting=True)
@@ -149,8 +129,6 @@ def test_a_clone_in_resting_surroundings_obeys_fermat_at_its_new_place(capture, 
         surface = distance * normal + grid @ across
     else:
         middle, axes = (t.detach().numpy() for t in old.shape())
-        from catacaustics.geometry import sphere_directions
-
         surface = middle + sphere_directions(50_000) @ axes.T
     surface = 0.7 * surface @ turn.T + move
     eye = center.numpy()
@@ -296,9 +274,7 @@ def test_a_reflector_is_found_by_name(ball):
 
 
 def test_the_commands_write_runs_that_can_be_rendered_and_never_overwrite_one(capture, ball, tmp_path, capsys):
-    run = tmp_path / "run"
-    ball.save(run / "scene.safetensors")
-    write_json(run / "config.json", {"capture": str(capture.root), "image_size": 64})
+    run = write_run(tmp_path / "run", capture, ball)
     commands = {
         "edit": ["--strength", "0.3", "--tint", "1", "0.5", "0.5", "--warp-gain", "2", "--warp-offset", "0", "0", "1"],
         "clone": ["--shift", "1.2", "0", "0", "--turn", "0", "90", "0", "--scale", "0.5", "--surroundings", "resting"],

@@ -76,6 +76,9 @@ def test_another_state_of_the_scene_takes_the_place_of_the_first(capture, scene,
     server = viser.ViserServer(host="127.0.0.1", port=port, verbose=False)
     try:
         viewer = Viewer(server, scene, capture, tmp_path, 480)
+        assert not viewer.clouds  # nobody wants to see them yet
+        viewer.clouds_shown.value = "all"
+        viewer._choose_shown()
         first = viewer.clouds["primary"].points.astype(float).mean(0)
         assert list(viewer.clouds) == ["primary", "reflection ball"]
         viewer.show(later)

@@ -1,16 +1,23 @@
-"""A tiny capture that tests make on the spot: a coloured floor and a ball that shows one flat colour, 10 views."""
+"""A tiny capture that tests make on the spot: a coloured floor and a ball that shows one flat colour, 10 views; and
+scenes of it that training has not touched."""
 
+import functools
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from catacaustics.cameras import Camera, pixel_centers
-from catacaustics.capture.dataset import View, open_capture, write_capture
+from catacaustics.capture.dataset import Capture, View, open_capture, write_capture
+from catacaustics.config import TrainConfig
+from catacaustics.files import write_json
 from catacaustics.geometry import look_at
 from catacaustics.images import write_image
 from catacaustics.points import PointCloud, write_ply
+from catacaustics.reflectors.volume import build_volume
+from catacaustics.scene import Scene
 from catacaustics.splatting import splat_points
+from catacaustics.training.initialize import initial_scene, named_reflectors, primary_seeds, reflection_seeds
 
 BALL_CENTER = np.array([0.0, -0.35, 0.0])
 BALL_RADIUS = 0.35
@@ -66,3 +73,32 @@ def make_toy_capture(root: Path, masks: bool = True, points: bool = True, width:
         write_ply(root / "points.ply", cloud)
     open_capture(root)
     return root
+
+
+@functools.cache  # nothing that is tested changes a scene
+def scene_of(capture: Capture, model: str) -> Scene:
+    """The scene from which training would start, opaque, with reflections in all colours."""
+    config = TrainConfig(
+        capture.root,
+        capture.root / "run",
+        model=(model,),
+        primary_points=6000,
+        reflection_points=800,
+        environment_width=20,
+        warp_width=16,
+    )
+    reflectors = named_reflectors([build_volume(capture, "ball")], config.model)
+    rng = np.random.default_rng(0)
+    seeds = [primary_seeds(capture, reflectors, config, rng), reflection_seeds(capture, reflectors[0], config, rng)]
+    scene = initial_scene(capture, reflectors, seeds, 1.0, config)
+    with torch.no_grad():
+        scene.primary.opacity_logits.fill_(8.0)  # opaque, so that nothing shines through
+        scene.reflections[0].features[:, :3] = torch.rand(800, 3, generator=torch.Generator().manual_seed(0))
+    return scene
+
+
+def write_run(folder: Path, capture: Capture, scene: Scene) -> Path:
+    """A scene as the run of a finished training."""
+    scene.save(folder / "scene.safetensors")
+    write_json(folder / "config.json", {"capture": str(capture.root), "image_size": 64})
+    return folder

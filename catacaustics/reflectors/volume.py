@@ -15,7 +15,7 @@ import numpy as np
 from catacaustics.cameras import Camera, Viewport
 from catacaustics.capture.dataset import Capture, View
 from catacaustics.errors import UserError
-from catacaustics.files import read_json, write_bytes, write_json
+from catacaustics.files import read_json, write_json
 from catacaustics.geometry import (
     chebyshev_center,
     hull_mesh,
@@ -24,6 +24,7 @@ from catacaustics.geometry import (
     normalize,
     transform,
 )
+from catacaustics.points import write_mesh
 from catacaustics.shapes import Bool, Float, Int
 
 _SMALLEST = 1e-6
@@ -168,15 +169,7 @@ class ReflectionVolume:
 
     def write_mesh(self, path: Path) -> None:
         """Write the surface as a PLY triangle mesh, for mesh viewers."""
-        import io
-
-        from plyfile import PlyData, PlyElement
-
-        vertices = np.array([tuple(v) for v in self.vertices], [(axis, "f4") for axis in "xyz"])
-        faces = np.array([(f,) for f in self.faces.astype(np.int32)], [("vertex_indices", "i4", (3,))])
-        buffer = io.BytesIO()
-        PlyData([PlyElement.describe(vertices, "vertex"), PlyElement.describe(faces, "face")]).write(buffer)
-        write_bytes(path, buffer.getvalue())
+        write_mesh(path, self.vertices, self.faces)
 
 
 def _fill_convex(polygon: np.ndarray, width: int, height: int) -> np.ndarray:

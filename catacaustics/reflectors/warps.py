@@ -234,7 +234,7 @@ def inner_warp(warp: nn.Module) -> nn.Module:
 
 def moved_mirror(
     warp: nn.Module, scale: float, rotation: Float[Tensor, "3 3"], shift: Float[Tensor, "3"]
-) -> nn.Module | None:
+) -> PlaneWarp | QuadricWarp | None:
     """The mirror at x_new = scale * rotation x + shift, in surroundings that stay where they are: physically right.
     None for rungs that do not consist of a mirror and world points."""
     with torch.no_grad():
@@ -245,6 +245,19 @@ def moved_mirror(
             center, axes = warp.shape()
             moved = scale * rotation @ center + shift, scale * rotation @ axes
             return QuadricWarp(*moved, len(warp.log_radii) == 1, bool(warp.concave))
+    return None
+
+
+def mirror_of(warp: nn.Module) -> PlaneWarp | QuadricWarp | None:
+    """The mirror of a rung at its place in the world, with what edits have done to it; None where there is none."""
+    if isinstance(warp, PlaneWarp | QuadricWarp):
+        return warp
+    if isinstance(warp, QuadricNeuralWarp):
+        return warp.quadric
+    if isinstance(warp, DecoupledWarp):
+        return mirror_of(warp.warp)
+    if isinstance(warp, MovedWarp) and (mirror := mirror_of(warp.warp)) is not None:
+        return moved_mirror(mirror, float(warp.scale), warp.rotation, warp.shift)
     return None
 
 

@@ -7,7 +7,7 @@ sharp ones as soon as it stands still.
 import threading
 import time
 import webbrowser
-from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any, get_args
 
@@ -18,12 +18,14 @@ from catacaustics.cameras import Camera, interpolate_path
 from catacaustics.capture.dataset import Capture
 from catacaustics.config import ViewConfig
 from catacaustics.errors import UserError
+from catacaustics.export import point_colors
 from catacaustics.geometry import rigid, rigid_inverse
-from catacaustics.images import to_bytes, write_image, write_video
+from catacaustics.images import to_bytes, write_image
 from catacaustics.layers import Layer, depth_range, layer_image
 from catacaustics.run import open_run, scene_file
 from catacaustics.scene import PointParameters, RenderOutput, Scene
 from catacaustics.shapes import Float, UInt8
+from catacaustics.video import film_key, frame_count, write_film
 from catacaustics.web.proposal import look_at_point
 from catacaustics.web.server import has_screen
 
@@ -102,6 +104,8 @@ class Viewer:
         self.windows: dict[int, _Window] = {}
         self.frozen: Camera | None = None
         self.path: list[Camera] = []
+        self.clouds: dict[str, Any] = {}
+        self.drawing_seconds = 0.0
         cameras = [v.camera for v in capture.train]
         self.target = look_at_point(cameras)
         self.reach = float(np.median([np.linalg.norm(c.center - self.target) for c in cameras]))
@@ -117,6 +121,7 @@ class Viewer:
         """Go over to another state of the scene."""
         with self.lock:
             self.scene = scene
+            self.drawing_seconds = 0.0
         self._show_scene()
         self.touch()
 
@@ -162,6 +167,8 @@ class Viewer:
             gui.add_button("Add this camera").on_click(self._add_key)
             gui.add_button("Start anew").on_click(self._clear_keys)
             self.seconds = gui.add_number("Seconds", 5.0, min=0.5, max=600.0, step=0.5)
+            self.fps = gui.add_number("Pictures a second", 24.0, min=1.0, max=120.0, step=1.0)
+            self.quality = gui.add_slider("Quality (lower is better)", 0, 51, 1, 20)
             gui.add_button("Render film").on_click(self._save_film)
         for control in (self.layer, self.size, self.warp, self.offset):
             control.on_update(lambda _: self.touch())
@@ -171,6 +178,8 @@ class Viewer:
     def _choose_shown(self) -> None:
         for frustum in self.frusta:
             frustum.visible = self.cameras_shown.value
+        if self.clouds_stale and self.clouds_shown.value != "none":
+            self._send_clouds()
         for name, cloud in self.clouds.items():
             kind = "primary" if name == "primary" else "reflections"
             cloud.visible = self.clouds_shown.value in (kind, "all")
@@ -218,15 +227,20 @@ class Viewer:
             return
         folder = self.folder / "films"
         number = 1 + max((int(p.stem) for p in folder.glob("*.mp4") if p.stem.isdecimal()), default=0)
-        cameras = interpolate_path(self.path, max(round(self.seconds.value * 24), 2))
+        cameras = interpolate_path(self.path, frame_count(self.seconds.value, self.fps.value))
         window = self.windows[event.client.client_id]
 
-        def frames() -> Iterator[np.ndarray]:
-            for i, camera in enumerate(cameras):
-                self.keys.content = f"Film: picture {i + 1} of {len(cameras)}"
-                yield window.picture(self.render(camera))
+        def draw(i: int) -> np.ndarray:
+            self.keys.content = f"Film: picture {i + 1} of {len(cameras)}"
+            return window.picture(self.render(cameras[i]))
 
-        self._try(event.client, folder / f"{number:03d}.mp4", lambda path: write_video(path, frames()))
+        frozen = self.frozen.camera_from_world.tolist() if self.frozen is not None else None
+        settings = self.layer.value, self.warp.value, self.offset.value, frozen, window.depths
+        with self.lock:
+            state = b"".join(t.cpu().numpy().tobytes() for t in self.scene.state_dict().values())
+        key = film_key(state, cameras, *settings)
+        work = partial(write_film, count=len(cameras), draw=draw, key=key, fps=self.fps.value)
+        self._try(event.client, folder / f"{number:03d}.mp4", partial(work, quality=int(self.quality.value)))
         self._tell_keys()
 
     def _try(self, client: Any, path: Path, work: Any) -> None:
@@ -258,13 +272,8 @@ class Viewer:
 
     def _show_scene(self) -> None:
         scene = self.server.scene
-        eye = np.mean([v.camera.center for v in self.capture.train], axis=0)
-        self.clouds, self.meshes = {}, []
-        for name, cloud in [("primary", self.scene.primary), *_reflections(self.scene)]:
-            positions, colors = _decoded(self.scene, cloud, eye, name == "primary")
-            self.clouds[name] = scene.add_point_cloud(
-                f"/points/{name}", positions, colors, point_size=0.004 * self.reach, visible=False
-            )
+        self.meshes = []
+        self.clouds_stale = True
         for volume in self.scene.volumes:
             self.meshes.append(
                 scene.add_mesh_simple(
@@ -277,6 +286,19 @@ class Viewer:
                 )
             )
         self._choose_shown()
+
+    def _send_clouds(self) -> None:
+        """The clouds' points to the browsers, at most _SHOWN_POINTS of each: only once they are wanted."""
+        eye = np.mean([v.camera.center for v in self.capture.train], axis=0)
+        self.clouds_stale, self.clouds = False, {}
+        for name, cloud in [("primary", self.scene.primary), *_reflections(self.scene)]:
+            rows = torch.randperm(len(cloud), generator=torch.Generator().manual_seed(0))[:_SHOWN_POINTS]
+            rows = rows.to(self.scene.device)
+            positions = cloud.positions.detach()[rows].float().cpu().numpy()
+            colors = to_bytes(point_colors(self.scene, cloud, eye, rows))
+            self.clouds[name] = self.server.scene.add_point_cloud(
+                f"/points/{name}", positions, colors, point_size=0.004 * self.reach, visible=False
+            )
 
     # Windows ---------------------------------------------------------------------------------------------------------
 
@@ -338,6 +360,7 @@ class _Window:
         picture = self.picture(output)
         self.client.scene.set_background_image(picture, "jpeg", jpeg_quality=92 if share == 1 else 80)
         seconds = time.perf_counter() - start
+        self.viewer.drawing_seconds += seconds
         height, width = picture.shape[:2]
         self.viewer.status.content = f"{1 / seconds:.1f} frames/s at {width} x {height}"
         if share == self.share:
@@ -355,17 +378,3 @@ def _reflections(scene: Scene) -> list[tuple[str, PointParameters]]:
     """Reflection clouds, named so that no reflector's name is taken for the primary cloud's."""
     clouds = [cloud for cloud in scene.reflections if isinstance(cloud, PointParameters)]
     return [(f"reflection {volume.name}", cloud) for volume, cloud in zip(scene.volumes, clouds, strict=True)]
-
-
-def _decoded(
-    scene: Scene, cloud: PointParameters, eye: np.ndarray, primary: bool
-) -> tuple[Float[np.ndarray, "n 3"], UInt8[np.ndarray, "n 3"]]:
-    """Positions of a cloud's points, at most _SHOWN_POINTS, and their colours seen from `eye`."""
-    with torch.no_grad():
-        index = torch.randperm(len(cloud), generator=torch.Generator().manual_seed(0))[:_SHOWN_POINTS]
-        index = index.to(scene.device)
-        positions, features = cloud.positions[index], cloud.features[index][None]
-        away = torch.nn.functional.normalize(positions - torch.tensor(eye).to(positions), dim=1)[None]
-        nothing = torch.zeros_like(features)
-        colors = scene.renderer(*((features, nothing) if primary else (nothing, features)), away)[0].clamp(0, 1)
-    return positions.float().cpu().numpy(), to_bytes(colors.float().cpu().numpy())
