@@ -7,6 +7,7 @@ front, and mirrors it near its rim, which stands for total internal reflection.
 from pathlib import Path
 
 import numpy as np
+from scipy.ndimage import map_coordinates
 
 from catacaustics.files import write_json
 from catacaustics.images import resize, write_image
@@ -60,11 +61,12 @@ def refract(directions, normals, eta):
 
 
 def texture_color(textures, wall, uv):
-    """Nearest texel, sRGB in [0, 1]; black where the wall is -1."""
+    """Bilinear, repeating, sRGB in [0, 1]; black where the wall is -1."""
     color = np.zeros((*wall.shape, 3), np.float32)
     for i, image in enumerate(textures):
-        at = (uv[wall == i] * image.shape[0]).astype(int)
-        color[wall == i] = image[at[:, 1], at[:, 0]] / 255
+        at = uv[wall == i][:, ::-1].T * image.shape[0] - 0.5
+        for c in range(3):
+            color[wall == i, c] = map_coordinates(image[..., c] / 255.0, at, order=1, mode="grid-wrap")
     return color
 
 

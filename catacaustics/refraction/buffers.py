@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
+from torch.utils.data import ConcatDataset
 
 from catacaustics.refraction.frames import Frame, Frames
 from catacaustics.refraction.lookup import Screen
@@ -110,7 +111,7 @@ def stack(parts: Sequence[Buffers]) -> Buffers:
 class BufferCache:
     """Buffers of a data set's frames, kept up to a number of bytes; what was not used for longest goes first."""
 
-    def __init__(self, frames: Frames, most_bytes: float):
+    def __init__(self, frames: Frames | ConcatDataset, most_bytes: float):
         self.frames, self.most = frames, most_bytes
         self.kept: OrderedDict[int, Buffers] = OrderedDict()
         self.bytes = 0

@@ -299,7 +299,7 @@ def load_part(path: Path) -> tuple[dict[str, Tensor], dict[str, Tensor], dict[st
         raise UserError(
             f"{path} has format {header.get('format')} of refraction networks.", f"format {FORMAT}", "train again"
         )
-    header["layout"] = Layout(header["layout"][0], tuple(header["layout"][1:]))
+    header["layout"] = Layout(header["layout"]["scene"], tuple(header["layout"]["textures"]))
     weights = {k.removeprefix("network."): v for k, v in tensors.items() if k.startswith("network.")}
     return weights, {k: v for k, v in tensors.items() if not k.startswith("network.")}, header
 

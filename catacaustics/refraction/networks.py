@@ -88,7 +88,8 @@ class ObjectEncoder(nn.Module):
         rays = buffers.rays.repeat_interleave(k, 0)
         x = _join(mask, encode(position, self.octaves), rest, rays)
         x = relu(self.second(relu(self.first(x)))) * mask
-        return x.unflatten(0, (b, k)).sum(1)
+        # Summed in float64: rounding then depends on the order only far below float32's last digit.
+        return x.unflatten(0, (b, k)).sum(1, dtype=torch.float64).to(x.dtype)
 
 
 class Generator(nn.Module):

@@ -4,7 +4,7 @@ import json
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from tqdm import tqdm
 
 from catacaustics.config import RefractTrainConfig
 from catacaustics.errors import UserError
-from catacaustics.files import write_json
+from catacaustics.files import write_bytes, write_json
 from catacaustics.losses import dssim
 from catacaustics.refraction.buffers import BufferCache, Buffers, frame_buffers, frame_screen, stack
 from catacaustics.refraction.frames import Frames, open_frames
@@ -50,10 +50,10 @@ class PartState:
 
     network: nn.Module
     optimizer: torch.optim.Optimizer
-    rng: np.random.Generator
     step: int = 0
     seconds: float = 0.0
-    queue: list[int] = field(default_factory=list)
+    whole: bool = True
+    """False while a step changes the weights: such a state is not worth keeping."""
 
 
 @dataclass(frozen=True)
@@ -93,9 +93,9 @@ def train(config: RefractTrainConfig) -> RefractionModel:
         _fit(model.generator, _Part("generator", every, config.lr_generator, minutes, losses), cache, model, config)
     if config.part != "generator":
         if model.generator is not None:
-            path = config.generator or run / "generator.safetensors"
-            _take_generator(model, path)
-            save_part(run / "generator.safetensors", model.generator, load_part(path)[2])
+            _take_generator(model, config.generator or run / "generator.safetensors")
+            if config.generator is not None:
+                write_bytes(run / "generator.safetensors", config.generator.read_bytes())
         minutes = config.minutes and config.minutes * (1 - share)
         losses = _renderer_step(model, cache, config)
         part = _Part("renderer", range(len(train_frames)), config.lr_renderer, minutes, losses)
@@ -212,8 +212,9 @@ def _fit(
     try:
         _loop(state, part, cache, model, config)
     except KeyboardInterrupt:
-        _save(state, part, model, config)
-        print(f"training: interrupted at step {state.step} of the {part.name}, checkpoint saved; go on with --resume")
+        if state.whole:
+            _save(state, part, model, config)
+        print(f"training: interrupted at step {state.step} of the {part.name}; go on with --resume")
         raise
     _save(state, part, model, config)
     save_part(finished, network, _header(state, model))
@@ -222,26 +223,25 @@ def _fit(
 def _start(network: nn.Module, part: _Part, config: RefractTrainConfig) -> PartState:
     groups = [{"params": [p], "name": name} for name, p in network.named_parameters()]
     optimizer = torch.optim.AdamW(groups, weight_decay=config.weight_decay, fused=True)
-    state = PartState(network, optimizer, np.random.default_rng([config.seed, part.name == "renderer"]))
+    state = PartState(network, optimizer)
     path = Path(config.run) / f"{part.name}.checkpoint.safetensors"
     if path.exists():
         weights, extra, header = load_part(path)
         fill(network, weights, path)
         restore_optimizer(state.optimizer, extra)
-        state.rng.bit_generator.state = header["rng"]
-        state.step, state.seconds, state.queue = header["step"], header["seconds"], header["queue"]
+        state.step, state.seconds = header["step"], header["seconds"]
         _trim_log(Path(config.run), part.name, state.step)
         print(f"training: going on from step {state.step} of the {part.name}")
     return state
 
 
 def _header(state: PartState, model: RefractionModel) -> dict[str, Any]:
-    layout = [model.layout.scene, *model.layout.textures]
-    return {"model": model.name, "size": model.size, "layout": layout, "step": state.step, "seconds": state.seconds}
+    own = {"model": model.name, "size": model.size, "layout": model.layout._asdict()}
+    return own | {"step": state.step, "seconds": state.seconds}
 
 
 def _save(state: PartState, part: _Part, model: RefractionModel, config: RefractTrainConfig) -> None:
-    """Weights, Adam's moments, random state and place in the schedule, in one atomic file.
+    """Weights, Adam's moments and place in the schedule, in one atomic file. Crops follow from seed and step.
 
     Raises:
         UserError: a weight is not finite; the older checkpoint stays.
@@ -249,9 +249,8 @@ def _save(state: PartState, part: _Part, model: RefractionModel, config: Refract
     bad = _first_not_finite(dict(state.network.named_parameters()))
     if bad:
         raise _not_finite(f"weight {bad} of the {part.name}", state.step)
-    notes = {"queue": state.queue, "rng": state.rng.bit_generator.state}
     path = Path(config.run) / f"{part.name}.checkpoint.safetensors"
-    save_part(path, state.network, _header(state, model) | notes, optimizer_tensors(state.optimizer))
+    save_part(path, state.network, _header(state, model), optimizer_tensors(state.optimizer))
 
 
 def _trim_log(run: Path, part: str, step: int) -> None:
@@ -283,9 +282,9 @@ def _loop(
             low = config.lr_final_share
             for group in state.optimizer.param_groups:
                 group["lr"] = part.rate * (low + (1 - low) * (1 + math.cos(math.pi * progress)) / 2)
-            batch, places = _draw(state, part, cache, config)
+            batch, places = _draw(state.step, part, cache, config)
             record = _step(state, part, batch.to(device), places)
-            state.step += 1
+            state.step, state.whole = state.step + 1, True
             state.seconds = clock() - started
             if state.step % _LOG_EVERY == 0:
                 row = {"part": part.name, "step": state.step, "seconds": round(state.seconds, 2)}
@@ -298,15 +297,16 @@ def _loop(
                 saved = time.monotonic()
 
 
-def _draw(state: PartState, part: _Part, cache: BufferCache, config: RefractTrainConfig) -> tuple[Buffers, list[Place]]:
-    """A batch of crops. Every frame is drawn once before any is drawn again."""
+def _draw(step: int, part: _Part, cache: BufferCache, config: RefractTrainConfig) -> tuple[Buffers, list[Place]]:
+    """The crops of a step. Every frame is drawn once before any is drawn again."""
     crops, places = [], []
-    for _ in range(config.batch):
-        if not state.queue:
-            state.queue = state.rng.permutation(part.indices).tolist()
-        index = state.queue.pop()
+    part_seed = [config.seed, int(part.name == "renderer")]
+    rng = np.random.default_rng([*part_seed, 0, step])
+    for draw in range(step * config.batch, (step + 1) * config.batch):
+        epoch, place = divmod(draw, len(part.indices))
+        index = int(np.random.default_rng([*part_seed, 1, epoch]).permutation(part.indices)[place])
         whole = cache.get(index)
-        y, x, side = _choose_crop(whole, config, state.rng)
+        y, x, side = _choose_crop(whole, config, rng)
         crops.append(whole.crop(y, x, side))
         places.append((index, y, x))
     return stack(crops), places
@@ -340,6 +340,7 @@ def _step(state: PartState, part: _Part, batch: Buffers, places: list[Place]) ->
     norm = torch.nn.utils.clip_grad_norm_(state.network.parameters(), _LONGEST_GRADIENT)
     if not torch.isfinite(norm + total.detach()):
         raise _not_finite(_culprit(state, part, batch, places, losses), state.step)
+    state.whole = False
     state.optimizer.step()
     return {"loss": total.item()} | {name: value.item() for name, value in losses.items()}
 

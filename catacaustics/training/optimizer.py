@@ -176,4 +176,9 @@ def restore_optimizer(optimizer: torch.optim.Optimizer, tensors: dict[str, Tenso
         parameter = group["params"][0]
         state = {k: tensors.get(f"adam.{group['name']}.{k}") for k in ("step", "exp_avg", "exp_avg_sq")}
         if all(v is not None for v in state.values()):
-            optimizer.state[parameter] = {k: v.to(parameter.device) for k, v in state.items() if v is not None}
+            # In the parameter's memory layout: fused steps go through memory, not through indices.
+            optimizer.state[parameter] = {
+                k: torch.empty_like(parameter).copy_(v) if v.shape == parameter.shape else v.to(parameter.device)
+                for k, v in state.items()
+                if v is not None
+            }
