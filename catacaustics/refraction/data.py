@@ -24,7 +24,7 @@ from catacaustics.images import write_image
 from catacaustics.refraction.contact import contact_sheet
 from catacaustics.refraction.frames import CARD, SPLITS, Frame, open_frames, sha256_of, shard_problem, write_shard
 from catacaustics.refraction.scenes import Scene, draw, find_scene, ranges, with_ranges
-from catacaustics.refraction.stage import MAX_DEPTH, Stage, camera_of, camera_rays, srgb, world_to_clip
+from catacaustics.refraction.stage import MAX_DEPTH, Stage, camera_of, camera_rays, srgb, whole_samples, world_to_clip
 from catacaustics.refraction.trace import MAX_EVENTS, land
 from catacaustics.refraction.variants import VECTORISED, choose_variant
 
@@ -53,10 +53,12 @@ def make_frame(scene: Scene, config: RefractDataConfig, split: str, index: int) 
     stage, camera, share = _stand(scene, np.random.default_rng(seeds), config.resolution)
     noise = int(seeds.generate_state(1)[0] >> 1)
     opaque = stage.gbuffer(camera)
-    screen = stage.gbuffer(camera.resized(config.screen, config.screen))
     size = (camera.height, camera.width)
     has_reference = split != "generator"
-    reference = srgb(stage.reference(camera, config.spp, noise)) if has_reference else np.zeros((*size, 3))
+    colour, depth = _screen(stage, camera, config.screen if has_reference else 0)
+    reference = (
+        srgb(stage.reference(camera, whole_samples(config.spp), noise)) if has_reference else np.zeros((*size, 3))
+    )
     return Frame(
         reference=reference.astype(np.float32),
         has_reference=has_reference,
@@ -65,8 +67,8 @@ def make_frame(scene: Scene, config: RefractDataConfig, split: str, index: int) 
         **stage.alone(camera),
         object_ior=np.array([b.ior for b in stage.scene.transparent], np.float32),
         **_landing(stage, camera),
-        screen=np.round(255 * np.clip(screen["albedo"], 0, 1)).astype(np.uint8),
-        screen_depth=screen["depth"],
+        screen=colour,
+        screen_depth=depth,
         world_to_clip=world_to_clip(camera).astype(np.float32),
         camera_position=camera.center.astype(np.float32),
         parameters=share.astype(np.float32),
@@ -89,6 +91,14 @@ def _stand(scene: Scene, rng: np.random.Generator, resolution: int) -> tuple[Sta
         "cameras inside the room, in free space",
         "narrow the ranges eye.distance, eye.azimuth, eye.elevation or eye.target, or those of the bodies in the way",
     )
+
+
+def _screen(stage: Stage, camera: Camera, side: int) -> tuple[np.ndarray, np.ndarray]:
+    """Colour and depth of the opaque scene in side x side pixels."""
+    if not side:
+        return np.zeros((0, 0, 3), np.uint8), np.zeros((0, 0), np.float32)
+    found = stage.gbuffer(camera.resized(side, side))
+    return np.round(255 * np.clip(found["albedo"], 0, 1)).astype(np.uint8), found["depth"]
 
 
 def _landing(stage: Stage, camera: Camera) -> dict[str, np.ndarray]:
@@ -161,7 +171,7 @@ def _start(config: RefractDataConfig, scene: Scene, variant: str) -> dict[str, A
         "splits": {s: getattr(config, s) for s in SPLITS},
         "resolution": config.resolution,
         "screen": config.screen,
-        "spp": config.spp,
+        "spp": whole_samples(config.spp),
         "max_depth": MAX_DEPTH,
         "max_events": MAX_EVENTS,
         "branch": "refraction, or reflection where Fresnel's reflectance exceeds 0.5",

@@ -68,7 +68,7 @@ class Frame:
     internal_reflection: Bool[np.ndarray, "h w"]
     """The path holds a total internal reflection."""
     screen: UInt8[np.ndarray, "s s 3"]
-    """Texture colour of the opaque scene from the same camera, sRGB-encoded; 0 x 0 pixels in frames without one."""
+    """Texture colour of the opaque scene from the same camera, sRGB-encoded; 0 x 0 pixels in the split generator."""
     screen_depth: Float[np.ndarray, "s s"]
     """Distance along the viewing axis at the pixels of `screen`."""
     world_to_clip: Float[np.ndarray, "4 4"]

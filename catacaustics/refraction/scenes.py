@@ -35,7 +35,8 @@ class Body:
         center, size: where it is; it is scaled about its origin.
         turn, tilt: degrees about its z axis, after degrees about its x axis.
         ior: index of refraction; given, the body is transparent.
-        inside: name of the transparent body that encloses this one.
+        inside: name of the transparent body that encloses this one and moves it along: centre, size, turn and tilt
+            are then in that body's coordinates.
         radiance: what it emits; above 0, it is a lamp.
     """
 
@@ -240,7 +241,7 @@ def cornell_walls() -> textures.Image:
 CUBE = partial(meshes.box, 1.0, 1.0, 1.0)
 SHEET_DOWN = meshes.ceiling
 RABBIT, RABBIT_TEXTURE = (lambda: rabbit()[0]), (lambda: textures.patchwork(rabbit()[1], 14, 6, seed=5))
-FLOOR_BOARDS = partial(textures.planks, 640, 16, 40, 6)
+FLOOR_BOARDS = partial(textures.planks, 20, 20, 40, 6)
 FLOOR_CHECKS = partial(textures.checkerboard, 24, 24, 16, textures.CREAM, (120, 126, 134))
 FLOOR_TILES = partial(textures.tiles, 18, 18, 28, 8)
 ROUND_TILES = partial(textures.tiles, 36, 9, 28, 9)
@@ -259,9 +260,9 @@ def _round_room(wall: Callable[[], textures.Image], ground: Callable[[], texture
         Body(
             "lamp",
             meshes.ceiling,
-            center=(Range(-0.2, 0.2), Range(-0.2, 0.2), 0.84),
-            size=0.65,
-            radiance=Range(2.6, 4.0),
+            center=(Range(-0.08, 0.08), Range(-0.08, 0.08), 0.84),
+            size=0.9,
+            radiance=Range(1.5, 2.3),
         ),
     )
 
@@ -273,7 +274,13 @@ CORNELL = Scene(
         Body("walls", meshes.walls, cornell_walls, (0.0, 0.0, -1.0)),
         Body("floor", meshes.floor, FLOOR_BOARDS, (0.0, 0.0, -0.99)),
         Body("ceiling", meshes.ceiling, PLASTER, (0.0, 0.0, 0.99)),
-        Body("lamp", meshes.ceiling, center=(Range(-0.2, 0.2), Range(-0.2, 0.3), 0.97), size=0.6, radiance=Range(4, 6)),
+        Body(
+            "lamp",
+            meshes.ceiling,
+            center=(Range(-0.1, 0.1), Range(-0.1, 0.1), 0.97),
+            size=0.85,
+            radiance=Range(2.2, 3.2),
+        ),
         Body(
             "teapot",
             teapot,
@@ -284,7 +291,7 @@ CORNELL = Scene(
         ),
         Body("sphere", None, center=(Range(0.3, 0.42), Range(-0.05, 0.3), -0.765), size=0.22, ior=Range(1.3, 1.7)),
     ),
-    Eye((0.0, 0.2, -0.72), Range(-30, 30), Range(6, 32), Range(1.0, 1.12), 54.0),
+    Eye((0.0, 0.2, -0.7), Range(-30, 30), Range(2, 22), Range(1.0, 1.12), 54.0),
 )
 
 HEMISPHERE = Scene(
@@ -293,28 +300,29 @@ HEMISPHERE = Scene(
     "land beside, behind or above the picture.",
     (
         *_round_room(ROUND_TILES, FLOOR_CHECKS),
-        Body("drum", meshes.drum, DRUM_LETTERS, (Range(-0.1, 0.1), 0.55, -0.1), 0.25, Range(0, 360)),
-        Body("stand", partial(meshes.drum, 128, 1.4), OAK, (0.0, -0.14, -0.515), 0.23),
+        Body("drum", meshes.drum, DRUM_LETTERS, (Range(-0.15, 0.15), 0.62, -0.1), 0.25, Range(0, 360)),
+        Body("stand", partial(meshes.drum, 128, 1.5), OAK, (0.0, 0.0, -0.56), 0.24),
         Body(
             "hemisphere",
             meshes.hemisphere,
             center=(0.0, 0.0, 0.0),
-            size=0.34,
-            turn=Range(-20, 20),
+            size=0.36,
+            turn=Range(130, 230),
             tilt=90.0,
             ior=Range(1.45, 1.65),
         ),
         Body(
             "egg",
             meshes.egg,
-            center=(Range(-0.04, 0.04), Range(-0.17, -0.15), Range(-0.03, 0.03)),
-            size=0.11,
-            tilt=Range(-30, 30),
+            center=(Range(-0.14, 0.14), Range(-0.1, 0.1), 0.46),
+            size=0.32,
+            turn=Range(0, 180),
+            tilt=Range(40, 110),
             ior=Range(1.8, 2.1),
             inside="hemisphere",
         ),
     ),
-    Eye((0.0, -0.1, 0.0), Range(-50, 50), Range(-8, 28), Range(0.76, 0.84), 50.0),
+    Eye((0.0, -0.06, 0.0), Range(-45, 45), Range(-8, 28), Range(0.8, 0.88), 50.0),
 )
 
 CHECKER = Scene(
@@ -323,19 +331,19 @@ CHECKER = Scene(
     "of rippled glass: texture coordinates jump everywhere, world coordinates do not.",
     (
         *_round_room(ROUND_LETTERS, FLOOR_BOARDS),
-        Body("rabbit", RABBIT, RABBIT_TEXTURE, (0.0, Range(0.38, 0.45), -0.75), 0.7, Range(-130, -50)),
+        Body("rabbit", RABBIT, RABBIT_TEXTURE, (0.0, Range(0.42, 0.48), -0.75), 0.7, Range(-130, -50)),
         Body(
             "sphere",
             None,
-            center=(Range(-0.2, -0.08), Range(-0.58, -0.54), Range(-0.45, -0.3)),
-            size=0.11,
+            center=(Range(-0.13, -0.01), Range(-0.54, -0.5), Range(-0.32, -0.14)),
+            size=0.1,
             ior=Range(1.3, 1.7),
         ),
         Body(
             "plate",
             ripple_glass,
-            center=(Range(0.1, 0.22), Range(-0.28, -0.2), -0.39),
-            turn=Range(-25, 25),
+            center=(Range(0.1, 0.22), Range(-0.22, -0.16), -0.39),
+            turn=Range(-20, 20),
             ior=Range(1.3, 1.7),
         ),
     ),

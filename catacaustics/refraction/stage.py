@@ -4,14 +4,15 @@ Mitsuba's cameras look along +z with x to the left and y up; ours have x to the 
 world_from_mitsuba = world_from_camera @ diag(-1, -1, 1, 1). Pixel centres are at +0.5 in both.
 """
 
+from collections.abc import Mapping
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from catacaustics.cameras import Camera, pixel_centers
 from catacaustics.errors import UserError
-from catacaustics.geometry import look_at, normalize, rigid_inverse, sphere_directions
+from catacaustics.geometry import look_at, normalize, rigid, rigid_inverse, sphere_directions
 from catacaustics.refraction.scenes import Body, Scene
 from catacaustics.refraction.trace import Hits, Media
 from catacaustics.shapes import Float, Int, UInt8
@@ -20,6 +21,7 @@ MAX_DEPTH = 24
 """Bounces of a reference's paths; Russian roulette from RUSSIAN_ROULETTE on."""
 RUSSIAN_ROULETTE = 4
 DIRECT_SAMPLES = 16
+"""Samples a pixel of the direct lighting."""
 CAMERA_CLEARANCE = 0.05
 """Free space that a camera needs around it."""
 NEAR, FAR = 0.01, 10.0
@@ -50,18 +52,39 @@ def world_to_clip(camera: Camera) -> Float[np.ndarray, "4 4"]:
     return projection @ camera.camera_from_world
 
 
+def whole_samples(spp: int) -> int:
+    """The next number of samples that fills a grid of strata, as Mitsuba's multi-jittered sampler does."""
+    columns = int(np.sqrt(spp))
+    return columns * -(-spp // columns)
+
+
 def srgb(linear: np.ndarray) -> np.ndarray:
     """sRGB encoding of linear light, clipped to [0, 1]."""
     x = np.clip(linear, 0, 1)
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)
 
 
-def _rotation(body: Body) -> np.ndarray:
+class Pose(NamedTuple):
+    """x_world = size * rotation @ x_body + center."""
+
+    center: tuple[float, float, float]
+    rotation: tuple[tuple[float, ...], ...]
+    size: float
+
+
+def _pose(body: Body, bodies: Mapping[str, Body]) -> Pose:
+    """Where a drawn body stands in the world."""
     turn, tilt = np.radians(body.turn), np.radians(body.tilt)  # pyright: ignore[reportArgumentType, reportCallIssue]
     c, s = np.cos(tilt), np.sin(tilt)
     about_x = np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
     c, s = np.cos(turn), np.sin(turn)
-    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ about_x
+    rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ about_x
+    center, size = np.array(body.center, float), float(body.size)  # pyright: ignore[reportArgumentType]
+    if body.inside:
+        outer = _pose(bodies[body.inside], bodies)
+        turned = np.array(outer.rotation)
+        center, rotation, size = outer.size * turned @ center + outer.center, turned @ rotation, outer.size * size
+    return Pose(tuple(center.tolist()), tuple(map(tuple, rotation.tolist())), size)
 
 
 @lru_cache(maxsize=32)
@@ -78,7 +101,7 @@ def _paint(body_texture: Any) -> Any:
 
 
 @lru_cache(maxsize=64)
-def _shape(body: Body, around: float) -> Any:
+def _shape(body: Body, pose: Pose, around: float) -> Any:
     """The Mitsuba shape of a drawn body. What does not move is made once."""
     import mitsuba as mi
 
@@ -87,10 +110,9 @@ def _shape(body: Body, around: float) -> Any:
     else:
         bsdf = mi.load_dict({"type": "dielectric", "int_ior": float(body.ior), "ext_ior": around})  # pyright: ignore[reportArgumentType]
     if body.mesh is None:
-        turned = np.eye(4)
-        turned[:3, :3], turned[:3, 3] = float(body.size) * _rotation(body), body.center  # pyright: ignore[reportArgumentType]
+        turned = rigid(pose.size * np.array(pose.rotation), np.array(pose.center))
         return mi.load_dict({"type": "sphere", "to_world": mi.ScalarTransform4f(turned), "bsdf": bsdf})
-    mesh = body.mesh().moved(_rotation(body), np.array(body.center, float), float(body.size))  # pyright: ignore[reportArgumentType]
+    mesh = body.mesh().moved(np.array(pose.rotation), np.array(pose.center), pose.size)
     properties = mi.Properties()
     properties["bsdf"] = bsdf
     if float(body.radiance) > 0:  # pyright: ignore[reportArgumentType]
@@ -125,7 +147,8 @@ class Stage:
         iors = {b.name: float(b.ior) for b in scene.transparent}  # pyright: ignore[reportArgumentType]
         outer = [iors.get(b.inside, 1.0) for b in scene.bodies]
         self.media = Media(np.array([iors.get(b.name, np.nan) for b in scene.bodies]), np.array(outer))
-        self._shapes = [_shape(body, around) for body, around in zip(scene.bodies, outer, strict=True)]
+        named = {b.name: b for b in scene.bodies}
+        self._shapes = [_shape(b, _pose(b, named), around) for b, around in zip(scene.bodies, outer, strict=True)]
         for body, shape in zip(scene.bodies, self._shapes, strict=True):
             box = shape.bbox()
             reach = float(max(*np.abs(np.array(box.min).ravel()), *np.abs(np.array(box.max).ravel())))
@@ -185,9 +208,7 @@ class Stage:
 
     def direct(self, camera: Camera, seed: int) -> Float[np.ndarray, "h w 3"]:
         """Direct lighting of the opaque bodies; linear radiance."""
-        return self._rendered(
-            self.opaque, camera, {"type": "direct", "emitter_samples": 1, "bsdf_samples": 0}, DIRECT_SAMPLES, seed
-        )
+        return self._rendered(self.opaque, camera, {"type": "direct"}, DIRECT_SAMPLES, seed)
 
     def _rendered(self, scene: Any, camera: Camera, integrator: Any, spp: int, seed: int) -> np.ndarray:
         import mitsuba as mi
@@ -202,7 +223,7 @@ class Stage:
                 "to_world": mi.ScalarTransform4f(
                     rigid_inverse(camera.camera_from_world) @ np.diag([-1.0, -1.0, 1.0, 1.0])
                 ),
-                "sampler": {"type": "independent"},
+                "sampler": {"type": "multijitter"},
                 "film": {
                     "type": "hdrfilm",
                     "width": camera.width,
