@@ -14,6 +14,7 @@ from typing import Annotated
 
 import numpy as np
 import tyro
+from scipy.spatial.transform import Rotation
 
 from catacaustics.capture.dataset import Capture, View, open_capture
 from catacaustics.catacaustic import displayed_points
@@ -62,10 +63,7 @@ def noisy_poses(capture: Capture, pixels: float, rng: np.random.Generator) -> Ca
 
     def disturbed(view: View) -> View:
         angle = pixels / view.camera.fx / np.sqrt(2)
-        w = rng.standard_normal(3) * angle
-        cross = np.array([[0, -w[2], w[1]], [w[2], 0, -w[0]], [-w[1], w[0], 0]])
-        rotation = np.linalg.qr(np.eye(3) + cross)[0]
-        rotation *= np.sign(np.diag(rotation))
+        rotation = Rotation.from_rotvec(rng.standard_normal(3) * angle).as_matrix()
         shift = rng.standard_normal(3) * angle * scene_extent(capture)
         moved = replace(view.camera, camera_from_world=rigid(rotation, shift) @ view.camera.camera_from_world)
         return View(view.name, moved)
