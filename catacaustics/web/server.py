@@ -48,18 +48,36 @@ def mask(config: MaskConfig) -> None:
     if config.import_ is not None:
         _import(MaskStore(capture), config.import_)
         return
-    with _listen(config.port) as listener:
+    serve(
+        painter_app(capture),
+        config.port,
+        config.browser,
+        f"Mask painter for {capture.root}",
+        "Masks are saved as you paint. Ctrl+C stops the server.",
+        f"The masks are in {capture.root / 'masks'}",
+    )
+
+
+def serve(app: Starlette, port: int, browser: bool, title: str, hint: str, end: str) -> None:
+    """Serve an application behind the guard until interrupted; prints its address, and opens it where there is a
+    screen.
+
+    Args:
+        port: on 127.0.0.1; where it is in use, any free one is taken.
+        title, hint, end: what is printed with the address, below it, and after the server has stopped.
+    """
+    with _listen(port) as listener:
         port = listener.getsockname()[1]
         token = secrets.token_urlsafe(16)
         address = f"http://127.0.0.1:{port}/{token}/"
-        print(f"Mask painter for {capture.root}:\n\n    {address}\n", flush=True)
-        if config.browser and has_screen():
+        print(f"{title}:\n\n    {address}\n", flush=True)
+        if browser and has_screen():
             threading.Timer(0.5, webbrowser.open, [address]).start()
         else:
             print(f"From another machine: ssh -N -L {port}:127.0.0.1:{port} THIS_MACHINE, then open the address there.")
-        print("Masks are saved as you paint. Ctrl+C stops the server.", flush=True)
+        print(hint, flush=True)
         settings = uvicorn.Config(
-            Guard(painter_app(capture), token, port),
+            Guard(app, token, port),
             log_level="warning",
             access_log=False,
             server_header=False,
@@ -69,7 +87,7 @@ def mask(config: MaskConfig) -> None:
         # uvicorn ends by itself, and passes the interrupt on where this process does not ignore it.
         with suppress(KeyboardInterrupt):
             uvicorn.Server(settings).run(sockets=[listener])
-        print(f"\nStopped. The masks are in {capture.root / 'masks'}")
+        print(f"\nStopped. {end}")
 
 
 def has_screen() -> bool:
@@ -177,13 +195,13 @@ def painter_app(capture: Capture) -> Starlette:
             Route("/api/state", lambda request: JSONResponse(_state(store))),
             Route("/api/masks", masks),
             Route("/api/photo/{view:int}", photograph),
-            *(Route(f"/api/{name}", _action(function), methods=["POST"]) for name, function in actions.items()),
+            *(Route(f"/api/{name}", json_action(function), methods=["POST"]) for name, function in actions.items()),
         ],
-        exception_handlers={UserError: _user_error, StaleMask: _stale},
+        exception_handlers={UserError: user_error_answer, StaleMask: _stale},
     )
 
 
-def _action(function: Callable[[dict[str, Any]], dict[str, Any]]) -> Callable[[Request], Any]:
+def json_action(function: Callable[[dict[str, Any]], dict[str, Any]]) -> Callable[[Request], Any]:
     """An endpoint that takes and gives JSON; the work is done in a thread."""
 
     async def endpoint(request: Request) -> Response:
@@ -198,7 +216,8 @@ def _action(function: Callable[[dict[str, Any]], dict[str, Any]]) -> Callable[[R
     return endpoint
 
 
-def _user_error(request: Request, error: Exception) -> Response:
+def user_error_answer(request: Request, error: Exception) -> Response:
+    """A UserError as JSON: found, expected, remedy."""
     assert isinstance(error, UserError)
     return JSONResponse({"found": error.found, "expected": error.expected, "remedy": error.remedy}, 422)
 
