@@ -11,7 +11,7 @@ _COMMANDS = {
     "reconstruct": ("catacaustics.reconstruct", "reconstruct", "ReconstructConfig"),
     "calibrate": ("catacaustics.capture.calibrate", "calibrate", "CalibrateConfig"),
     "mask": ("catacaustics.web.server", "mask", "MaskConfig"),
-    "train": ("catacaustics.training.train", "train", "TrainConfig"),
+    "train": ("catacaustics.web.live", "train_in_view", "TrainConfig"),
     "evaluate": ("catacaustics.evaluation", "evaluate", "EvaluateConfig"),
     "ablate": ("catacaustics.ablation", "ablate", "AblateConfig"),
     "view": ("catacaustics.web.viewer", "view", "ViewConfig"),

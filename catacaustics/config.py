@@ -144,6 +144,8 @@ class TrainConfig:
     lr_exposure: float = 5e-3
     """Of the logarithms of exposure gains; decays to 1/10."""
     checkpoint_minutes: float = 2.0
+    view: bool = False
+    """Open the viewer on the scene in training; it closes with it."""
     seed: int = 0
     device: Literal["auto", "cpu", "cuda"] = "auto"
 
@@ -441,8 +443,8 @@ class RefractDataConfig:
     """Side of the square images in pixels."""
     screen: int = 1024
     """Side of the screen-space colour buffer in pixels."""
-    spp: int = 128
-    """Samples a pixel of the references."""
+    spp: int = 100
+    """Samples a pixel of the references, rounded up to a whole grid of strata."""
     ranges: tuple[str, ...] = ()
     """Ranges other than the scene's own, as NAME=LOW:HIGH or NAME=VALUE; the card lists names and ranges."""
     seed: int = 0

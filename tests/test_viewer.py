@@ -1,8 +1,11 @@
 """The viewer: its cameras, and that a browser sees what `render` makes."""
 
+import copy
 import shutil
 import socket
 import time
+from contextlib import nullcontext
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -11,6 +14,7 @@ import viser
 from stand_in import make_run
 from toy import make_toy_capture
 
+from catacaustics import cli
 from catacaustics.capture.dataset import open_capture
 from catacaustics.config import TrainConfig
 from catacaustics.errors import UserError
@@ -19,6 +23,7 @@ from catacaustics.reflectors.volume import build_volume
 from catacaustics.run import open_run
 from catacaustics.scene import Scene
 from catacaustics.training.initialize import Reflector, initial_scene, primary_seeds, reflection_seeds
+from catacaustics.web import live
 from catacaustics.web.viewer import Viewer, _quaternion, window_camera
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -163,3 +168,93 @@ def test_a_browser_shows_the_frame_that_render_makes(capture, scene, tmp_path):
             browser.close()
     finally:
         server.stop()
+
+
+class Looker:
+    """What a browser's window is to the viewer, without a browser."""
+
+    client_id = 7
+
+    def __init__(self, camera):
+        self.pictures, self.scene, pose = [], self, camera.camera_from_world
+        aspect = camera.width / camera.height
+        self.camera = SimpleNamespace(
+            wxyz=_quaternion(pose[:3, :3].T), position=camera.center, fov=0.8, aspect=aspect, on_update=lambda _: None
+        )
+        self.atomic = nullcontext
+
+    def set_background_image(self, image, *_, **__):
+        self.pictures.append(image)
+
+
+def free_port() -> int:
+    with socket.create_server(("127.0.0.1", 0)) as free:
+        return free.getsockname()[1]
+
+
+def test_a_training_is_copied_only_while_somebody_looks_and_shown_as_it_was(capture, scene, tmp_path, monkeypatch):
+    monkeypatch.setattr(live, "_SECONDS", 0.0)
+    monkeypatch.setattr(live, "_SHARE", 1e9)
+    view = live.LiveView(capture, tmp_path, 64, free_port(), browser=False)
+    training = copy.deepcopy(scene)
+    try:
+        view.watch(training)
+        view.watch(training)
+        assert view.copies == 1  # the first one; then nobody looked
+        looker = Looker(capture.views[0].camera)
+        view.viewer._connect(looker)
+        with torch.no_grad():
+            training.primary.features += 0.3
+        view.watch(training)
+        assert view.copies == 2
+        camera = capture.views[0].camera
+        expected = training.render(camera).rgb
+        with torch.no_grad():
+            training.primary.features += 0.3  # the training goes on
+        assert torch.equal(view.viewer.render(camera).rgb, expected)
+        deadline = time.monotonic() + 30
+        while not any(image.shape[1] == 64 for image in looker.pictures):
+            assert time.monotonic() < deadline
+            time.sleep(0.02)
+        assert view.viewer.drawing_seconds > 0
+        view.viewer._disconnect(looker)
+        view.watch(training)
+        assert view.copies == 2
+    finally:
+        view.close()
+
+
+def test_watching_takes_its_share_of_the_time_at_most(capture, scene, tmp_path):
+    view = live.LiveView(capture, tmp_path, 64, free_port(), browser=False)
+    try:
+        view.watch(scene)
+        assert view.due >= time.monotonic() + live._SECONDS - 1
+        view.viewer.windows[1] = object()
+        view.due, view.viewer.drawing_seconds = 0.0, 5.0
+        view.viewer.touch = lambda: None
+        view.watch(scene)
+        assert view.due > time.monotonic() + 45  # five seconds of drawing in fifty
+    finally:
+        view.close()
+
+
+def test_what_goes_wrong_with_the_window_does_not_stop_the_training(capture, scene, tmp_path, capsys):
+    view = live.LiveView(capture, tmp_path, 64, free_port(), browser=False)
+    try:
+        view.start = lambda scene: 1 / 0
+        view.watch(scene)
+        view.watch(scene)
+        assert capsys.readouterr().out.count("the training goes on") == 1
+    finally:
+        view.close()
+
+
+def test_train_opens_the_viewer_and_closes_it_when_it_is_done(tmp_path, capsys):
+    root = make_toy_capture(tmp_path / "capture")
+    small = ["--iterations", "25", "--image-size", "64", "--primary-points", "1000", "--environment-width", "20"]
+    assert cli.main(["train", str(root), str(tmp_path / "run"), "--model", "none", *small, "--view"]) == 0
+    told = capsys.readouterr().out
+    port = int(told.split("has a scene:\n\n    http://127.0.0.1:")[1].split("/")[0])
+    with pytest.raises(ConnectionRefusedError), socket.create_connection(("127.0.0.1", port), timeout=5):
+        pass
+    assert (tmp_path / "run" / "scene.safetensors").is_file()

@@ -56,6 +56,7 @@ _WARM, _DENSIFIED = STAGES[-2].end, 0.8
 
 PROBES = (0.1, 0.2, 0.35, 0.5, 0.75, 1.0)
 Probe = Callable[[Scene, float, int], None]
+Watch = Callable[[Scene], None]
 
 
 @dataclass
@@ -75,11 +76,18 @@ class TrainState:
     densified: int = 0
 
 
-def fit(capture: Capture, reflectors: list[Reflector], config: TrainConfig, probe: Probe | None = None) -> Scene:
+def fit(
+    capture: Capture,
+    reflectors: list[Reflector],
+    config: TrainConfig,
+    probe: Probe | None = None,
+    watch: Watch | None = None,
+) -> Scene:
     """Train a scene of known models; writes RUN/scene.safetensors and keeps RUN/checkpoint.safetensors while at it.
 
     Args:
         probe: called with scene, seconds and steps at the shares PROBES of the training; its time does not count.
+        watch: called with the scene after every step; its time counts.
 
     Raises:
         UserError: a value that is not finite.
@@ -95,7 +103,7 @@ def fit(capture: Capture, reflectors: list[Reflector], config: TrainConfig, prob
     seeds += [reflection_seeds(capture, r, config, rng) for r in reflectors]
     state = _start(capture, reflectors, seeds, config, rng)
     try:
-        _loop(state, capture, [r.volume for r in reflectors], seeds, config, probe)
+        _loop(state, capture, [r.volume for r in reflectors], seeds, config, probe, watch)
     except KeyboardInterrupt:
         save_checkpoint(run, state)
         print(f"training: interrupted at step {state.step}, checkpoint saved; go on with --resume")
@@ -197,6 +205,7 @@ def _loop(
     seeds: list[Seeds],
     config: TrainConfig,
     probe: Probe | None,
+    watch: Watch | None,
 ) -> None:
     run = Path(config.run)
     photographs = PhotographCache(capture)
@@ -218,6 +227,8 @@ def _loop(
                 densify(state.scene, state.optimizer, state.statistics, config.densify_share, config.max_primary_points)
                 state.statistics = GradientStatistics(len(state.scene.primary), state.scene.device)
                 state.densified += 1
+            if watch is not None:
+                watch(state.scene)
             state.seconds = time.monotonic() - started
             if probe is not None and _progress(state, config) >= PROBES[min(probed, len(PROBES) - 1)]:
                 probe(state.scene, state.seconds, state.step)

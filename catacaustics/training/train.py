@@ -10,12 +10,15 @@ from catacaustics.files import write_json
 from catacaustics.reflectors.volume import build_volume
 from catacaustics.scene import Scene
 from catacaustics.training.initialize import named_reflectors
-from catacaustics.training.loop import device_of, fit
+from catacaustics.training.loop import Watch, device_of, fit
 from catacaustics.training.selection import choose_models
 
 
-def train(config: TrainConfig) -> Scene:
+def train(config: TrainConfig, watch: Watch | None = None) -> Scene:
     """Train a scene; where a model is `auto`, choose it first (RUN/model_choice.html tells why).
+
+    Args:
+        watch: called with the scene after every step, trials left out.
 
     Raises:
         UserError: no capture, no volume, an unfinished run without --resume, or a value that is not finite.
@@ -39,4 +42,4 @@ def train(config: TrainConfig) -> Scene:
     config = choose_models(capture, volumes, config)
     chosen = {k: v for k, v in asdict(config).items() if k not in ("capture", "run")}
     write_json(run / "config.json", settings | chosen)
-    return fit(capture, named_reflectors(volumes, config.model), config)
+    return fit(capture, named_reflectors(volumes, config.model), config, watch=watch)

@@ -43,16 +43,11 @@ def view(config: ViewConfig) -> None:
     Raises:
         UserError: no scene yet, or no capture.
     """
-    import viser
-
     run = open_run(config.run, config.capture, config.device, unfinished=True)
     shown = scene_file(config.run, unfinished=True).stat().st_mtime_ns
-    server = viser.ViserServer(host="127.0.0.1", port=config.port, label="catacaustics", verbose=False)
+    server, address = serve(config.port, config.browser)
     viewer = Viewer(server, run.scene, run.capture, run.folder, config.image_size)
-    address = f"http://127.0.0.1:{server.get_port()}/"
     print(f"Viewer for {run.folder}:\n\n    {address}\n\nCtrl+C stops it.", flush=True)
-    if config.browser and has_screen():
-        webbrowser.open(address)
     try:
         while True:
             time.sleep(2)
@@ -65,6 +60,18 @@ def view(config: ViewConfig) -> None:
         print("\nStopped.")
     finally:
         server.stop()
+
+
+def serve(port: int, browser: bool) -> tuple[Any, str]:
+    """A viser server on 127.0.0.1 at this port or the next free one, and its address, opened in the browser where that
+    is wanted and there is a screen."""
+    import viser
+
+    server = viser.ViserServer(host="127.0.0.1", port=port, label="catacaustics", verbose=False)
+    address = f"http://127.0.0.1:{server.get_port()}/"
+    if browser and has_screen():
+        webbrowser.open(address)
+    return server, address
 
 
 def window_camera(
@@ -149,7 +156,7 @@ class Viewer:
         gui = self.server.gui
         self.status = gui.add_markdown("")
         self.layer = gui.add_dropdown("Layer", get_args(Layer))
-        self.size = gui.add_slider("Picture size", 200, max(2000, image_size), 20, image_size)
+        self.size = gui.add_slider("Picture size", min(200, image_size), max(2000, image_size), 20, image_size)
         names = [v.name for v in self.capture.views]
         self.photograph = gui.add_dropdown("Photograph", names)
         gui.add_button("Go there").on_click(lambda event: self._go(event.client, names.index(self.photograph.value)))
