@@ -25,6 +25,7 @@ _COMMANDS = {
     "refract train": ("catacaustics.refraction.train", "train", "RefractTrainConfig"),
     "refract evaluate": ("catacaustics.refraction.evaluate", "evaluate", "RefractEvaluateConfig"),
     "refract report": ("catacaustics.refraction.report", "report", "RefractReportConfig"),
+    "refract view": ("catacaustics.web.refraction", "view_refraction", "RefractViewConfig"),
     "doctor": ("catacaustics.doctor", "doctor", "DoctorConfig"),
 }
 

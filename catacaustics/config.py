@@ -557,5 +557,20 @@ class RefractReportConfig:
 
 
 @dataclass(frozen=True)
+class RefractViewConfig:
+    """Move the objects, the light and the index of refraction of a trained refraction model in the browser."""
+
+    run: Path
+    """Folder that `catacaustics refract train` wrote."""
+    data: Path | None = None
+    """The data set, where it is not the one of the training."""
+    browser: bool = True
+    """Open the page in the browser; its address is printed in any case."""
+    port: int = 8644
+    """Port on 127.0.0.1; where it is in use, any free one is taken."""
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+
+
+@dataclass(frozen=True)
 class DoctorConfig:
     """What is installed, what it can do here, and what would make it faster."""
