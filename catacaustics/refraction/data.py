@@ -30,6 +30,8 @@ from catacaustics.refraction.variants import VECTORISED, choose_variant
 
 SHARD = 10
 """Frames in a shard, at most."""
+NOISES = 16
+"""Seeds of the sampler: it compiles a kernel for each, half a second, so that frames share them."""
 TRIES = 20
 """Draws of a frame whose camera stands badly."""
 
@@ -51,7 +53,7 @@ def make_frame(scene: Scene, config: RefractDataConfig, split: str, index: int) 
     """
     seeds = np.random.SeedSequence([config.seed, SPLITS.index(split), index])
     stage, camera, share = _stand(scene, np.random.default_rng(seeds), config.resolution)
-    noise = int(seeds.generate_state(1)[0] >> 1)
+    noise = int(seeds.generate_state(1)[0] % NOISES)
     opaque = stage.gbuffer(camera)
     size = (camera.height, camera.width)
     has_reference = split != "generator"
@@ -63,7 +65,7 @@ def make_frame(scene: Scene, config: RefractDataConfig, split: str, index: int) 
         reference=reference.astype(np.float32),
         has_reference=has_reference,
         **opaque,
-        direct=srgb(stage.direct(camera, noise)).astype(np.float32),
+        direct=srgb(stage.direct(camera)).astype(np.float32),
         **stage.alone(camera),
         object_ior=np.array([b.ior for b in stage.scene.transparent], np.float32),
         **_landing(stage, camera),

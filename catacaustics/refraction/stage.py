@@ -206,9 +206,9 @@ class Stage:
             self.full, camera, {"type": "path", "max_depth": MAX_DEPTH, "rr_depth": RUSSIAN_ROULETTE}, spp, seed
         )
 
-    def direct(self, camera: Camera, seed: int) -> Float[np.ndarray, "h w 3"]:
+    def direct(self, camera: Camera) -> Float[np.ndarray, "h w 3"]:
         """Direct lighting of the opaque bodies; linear radiance."""
-        return self._rendered(self.opaque, camera, {"type": "direct"}, DIRECT_SAMPLES, seed)
+        return self._rendered(self.opaque, camera, {"type": "direct"}, DIRECT_SAMPLES, 0)
 
     def _rendered(self, scene: Any, camera: Camera, integrator: Any, spp: int, seed: int) -> np.ndarray:
         import mitsuba as mi
