@@ -12,6 +12,8 @@ import numpy as np
 from catacaustics.geometry import normalize
 from catacaustics.shapes import Float, Int
 
+Vector = Sequence[float | int] | np.ndarray
+
 
 @dataclass(frozen=True, eq=False)
 class Mesh:
@@ -59,10 +61,10 @@ def lattice(points: Float[np.ndarray, "r c 3"], normals: Float[np.ndarray, "r c 
 
 
 def sheet(
-    top_left: Sequence[float],
-    right: Sequence[float],
-    down: Sequence[float],
-    window: tuple[float, float, float, float] = (0, 0, 1, 1),
+    top_left: Vector,
+    right: Vector,
+    down: Vector,
+    window: Vector = (0, 0, 1, 1),
 ) -> Mesh:
     """A flat rectangle seen from its front, with a window (u0, v0, u1, v1) of its texture."""
     o, r, d = (np.asarray(v, float) for v in (top_left, right, down))
@@ -180,7 +182,7 @@ def smooth_union(blend: float, *parts: np.ndarray) -> np.ndarray:
     return total
 
 
-def ellipsoid(points: np.ndarray, center: Sequence[float], radii: Sequence[float]) -> np.ndarray:
+def ellipsoid(points: np.ndarray, center: Vector, radii: Vector) -> np.ndarray:
     """Nearly the signed distance of an ellipsoid."""
     p = points - np.asarray(center)
     scaled, steep = p / np.asarray(radii), p / np.square(radii)
@@ -188,14 +190,14 @@ def ellipsoid(points: np.ndarray, center: Sequence[float], radii: Sequence[float
     return k0 * (k0 - 1) / np.maximum(k1, 1e-9)
 
 
-def capsule(points: np.ndarray, a: Sequence[float], b: Sequence[float], thick: float, thin: float) -> np.ndarray:
+def capsule(points: np.ndarray, a: Vector, b: Vector, thick: float, thin: float) -> np.ndarray:
     """Distance of a rod from a to b whose radius goes from `thick` to `thin`."""
     start, along = np.asarray(a, float), np.asarray(b, float) - np.asarray(a, float)
     t = np.clip((points - start) @ along / (along @ along), 0, 1)
     return np.linalg.norm(points - start - t[:, None] * along, axis=-1) - (thick + (thin - thick) * t)
 
 
-def body(distance: Distance, low: Sequence[float], high: Sequence[float], cells: int = 64) -> Mesh:
+def body(distance: Distance, low: Vector, high: Vector, cells: int = 64) -> Mesh:
     """The surface of a distance function: surface nets (Gibson, MICCAI 1998), then moved onto the zero level.
 
     Args:
