@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from catacaustics.geometry import rigid, rigid_inverse, rotation_angle, transform
+from catacaustics.geometry import normalize, rigid, rigid_inverse, rotation_angle, transform
 from catacaustics.shapes import Float
 
 
@@ -94,6 +94,11 @@ class Camera:
     def unproject(self, pixels: Float[np.ndarray, "*n 2"], depth: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n 3"]:
         """World points at depth z along the rays through pixel coordinates."""
         return self.center + self.ray_directions(pixels) * depth[..., None]
+
+
+def up_direction(cameras: Sequence[Camera]) -> Float[np.ndarray, "3"]:
+    """Up in the world as photographers hold cameras: the mean of the cameras' own."""
+    return normalize(-np.mean([c.camera_from_world[1, :3] for c in cameras], axis=0))
 
 
 def pixel_centers(viewport: Viewport) -> Float[np.ndarray, "height width 2"]:

@@ -239,7 +239,9 @@ class EditConfig:
     tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
     """Colour that reflections are multiplied with (RGB)."""
     surroundings: Path | None = None
-    """Latitude-longitude image that the reflector shall mirror instead."""
+    """Latitude-longitude image that the reflector shall mirror instead, its top row up."""
+    surroundings_turn: float = 0.0
+    """Turn of that image about the vertical, in degrees."""
     warp_offset: tuple[float, float, float] = (0.0, 0.0, 0.0)
     """Reflections follow a camera displaced by this from the view's (world units and axes)."""
     warp_gain: float = 1.0

@@ -8,10 +8,12 @@ import numpy as np
 import torch
 from torch import nn
 
+from catacaustics.cameras import up_direction
 from catacaustics.config import CloneConfig, EditConfig
 from catacaustics.environment import texels
 from catacaustics.errors import UserError
 from catacaustics.files import write_json
+from catacaustics.geometry import normalize
 from catacaustics.images import read_image
 from catacaustics.reflectors.volume import ReflectionVolume
 from catacaustics.reflectors.warps import (
@@ -201,9 +203,19 @@ def adjust_reflections(
     return edited
 
 
-def replace_surroundings(scene: Scene, index: int, panorama: Float[np.ndarray, "height width 3"]) -> Scene:
-    """Let a reflector mirror another place: its points take the colours of a latitude-longitude image around it (y is
-    up at the top row, as in environment.py), looked up in the direction of what they mirror.
+def replace_surroundings(
+    scene: Scene,
+    index: int,
+    panorama: Float[np.ndarray, "height width 3"],
+    up: Float[np.ndarray, "3"] | None = None,
+    turn: float = 0.0,
+) -> Scene:
+    """Let a reflector mirror another place: its points take the colours of a latitude-longitude image around it, looked
+    up in the direction of what they mirror.
+
+    Args:
+        up: the direction of the image's top row; left out, -y, as in environment.py.
+        turn: of the image about that direction, in degrees.
 
     Raises:
         UserError: the model does not keep world positions of what is mirrored.
@@ -219,11 +231,26 @@ def replace_surroundings(scene: Scene, index: int, panorama: Float[np.ndarray, "
     cloud: PointParameters = edited.reflections[index]  # pyright: ignore[reportAssignmentType]
     with torch.no_grad():
         center = torch.from_numpy(scene.volumes[index].center).to(cloud.positions)
-        directions = torch.nn.functional.normalize(_mirrored(scene, index) - center, dim=1)
+        upright = torch.from_numpy(_upright(up, turn)).to(center)
+        directions = torch.nn.functional.normalize(_mirrored(scene, index) - center, dim=1) @ upright.T
         colors = torch.from_numpy(np.ascontiguousarray(panorama, np.float32)).to(scene.device)
         cloud.features.zero_()
         cloud.features[:, :3] = colors[texels(directions, *panorama.shape[:2])]
     return edited
+
+
+def _upright(up: Float[np.ndarray, "3"] | None, turn: float) -> Float[np.ndarray, "3 3"]:
+    """The rotation that takes `up` to -y, and then turns about it."""
+    from scipy.spatial.transform import Rotation
+
+    down = np.array([0.0, 1.0, 0.0])
+    about = Rotation.from_rotvec(np.radians(turn) * down)
+    if up is None:
+        return about.as_matrix()
+    axis, cosine = np.cross(up, -down), float(up @ -down / np.linalg.norm(up))
+    if np.linalg.norm(axis) < 1e-9:
+        axis = np.array([1.0, 0.0, 0.0])
+    return (about * Rotation.from_rotvec(np.arccos(np.clip(cosine, -1, 1)) * normalize(axis))).as_matrix()
 
 
 def _mirrored(scene: Scene, index: int) -> torch.Tensor:
@@ -254,7 +281,9 @@ def edit(config: EditConfig) -> None:
         )
     scene = run.scene
     if config.surroundings is not None:
-        scene = replace_surroundings(scene, index, read_image(config.surroundings))
+        up = up_direction([v.camera for v in run.capture.views])
+        panorama = read_image(config.surroundings)
+        scene = replace_surroundings(scene, index, panorama, up, config.surroundings_turn)
     scene = adjust_reflections(scene, index, config.strength, config.tint)
     if any(config.warp_offset) or config.warp_gain != 1:
         pivot = config.warp_pivot or named_view(run.capture, None).camera.center

@@ -281,7 +281,7 @@ class Scene(nn.Module):
 
         def show(points: Tensor, start: Tensor | None = None) -> Displayed:
             shown = warp(points, warp_center, start)
-            return painted(shown, warp_center) if decoupled else shown
+            return painted(shown, warp_center, center) if decoupled else shown
 
         with torch.no_grad():
             shown = show(cloud.positions)

@@ -76,7 +76,7 @@ def test_comfort_lowers_the_disparity_of_reflections_step_by_step_to_that_of_the
     assert (np.diff(high) < 0).all()
     assert (np.diff(vertical) < 0).all()
     assert high[0] > 1.4 * surface.high
-    assert high[-1] == pytest.approx(surface.high, rel=0.05)
+    assert high[-1] == pytest.approx(surface.high, rel=0.12)  # blended over coarse splats
     assert steps[-1].median == pytest.approx(surface.median, abs=0.1)
     assert vertical[-1] < 0.05 < vertical[0]
     assert surface.vertical == pytest.approx(0, abs=1e-9)

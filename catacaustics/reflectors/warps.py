@@ -30,25 +30,22 @@ class Displayed(NamedTuple):
     near: Float[Tensor, "n"] | None = None
 
 
-_BEHIND = 1e-3
-"""Painted images keep their order in depth within this share of it."""
+def painted(shown: Displayed, center: Float[Tensor, "3"], eye: Float[Tensor, "3"]) -> Displayed:
+    """What the camera centre sees, painted on the mirror and looked at by another eye: every point is seen where the
+    centre's ray to it meets the mirror. On the eye's ray it is kept at the length of the path, so that nearer mirrored
+    points still hide farther ones.
 
-
-def painted(shown: Displayed, center: Float[Tensor, "3"]) -> Displayed:
-    """What the camera centre sees, painted on the mirror: every point on its ray where that meets the mirror, farther
-    ones a hair behind.
-
-    Seen from the centre nothing changes. From elsewhere the reflection stays on the mirror and looks as it does from
-    the centre; images at their optical depth would leave the mirror's outline. Rungs that do not know their mirror are
-    returned as they are.
+    For the eye at the centre nothing changes. From elsewhere the reflection stays on the mirror; images at their
+    optical depth would leave its outline. Rungs that do not know their mirror are returned as they are.
     """
     if shown.near is None:
         return shown
     rays = shown.positions - center
-    share = shown.near / rays.norm(dim=1).clamp_min(1e-12)
-    share = share + _BEHIND * (1 - share)
-    stretch = share**2 if shown.stretch is None else share**2 * shown.stretch
-    return shown._replace(positions=center + share[:, None] * rays, stretch=stretch.detach(), near=None)
+    length = rays.norm(dim=1).clamp_min(1e-12)
+    view = center + (shown.near / length)[:, None] * rays - eye
+    distance = view.norm(dim=1).clamp_min(1e-12)
+    stretch = (shown.near / distance) ** 2 if shown.stretch is None else (shown.near / distance) ** 2 * shown.stretch
+    return shown._replace(positions=eye + (length / distance)[:, None] * view, stretch=stretch.detach(), near=None)
 
 
 def rotation_matrix(vector: Float[Tensor, "3"]) -> Float[Tensor, "3 3"]:
@@ -224,7 +221,7 @@ class DecoupledWarp(nn.Module):
     def forward(self, points: Points, center: Float[Tensor, "3"], start: Points | None = None) -> Displayed:
         followed = center + self.strength * ((self.gain - 1) * (center - self.pivot) + self.offset)
         shown = self.warp(points, followed, start)
-        return shown if torch.equal(followed, center) else painted(shown, followed)._replace(near=None)
+        return shown if torch.equal(followed, center) else painted(shown, followed, center)._replace(near=None)
 
 
 def inner_warp(warp: nn.Module) -> nn.Module:

@@ -14,7 +14,7 @@ from typing import Any, get_args
 import numpy as np
 import torch
 
-from catacaustics.cameras import Camera, interpolate_path
+from catacaustics.cameras import Camera, interpolate_path, up_direction
 from catacaustics.capture.dataset import Capture
 from catacaustics.config import ViewConfig
 from catacaustics.errors import UserError
@@ -116,7 +116,7 @@ class Viewer:
         cameras = [v.camera for v in capture.train]
         self.target = look_at_point(cameras)
         self.reach = float(np.median([np.linalg.norm(c.center - self.target) for c in cameras]))
-        server.scene.set_up_direction(tuple(-np.mean([c.camera_from_world[1, :3] for c in cameras], axis=0)))
+        server.scene.set_up_direction(tuple(up_direction(cameras)))
         server.gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False)
         self._controls(image_size)
         self._show_cameras()
