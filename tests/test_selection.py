@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 from toy import make_toy_capture
 
+from catacaustics.capture.dataset import open_capture
 from catacaustics.config import TrainConfig
 from catacaustics.errors import UserError
-from catacaustics.reflectors.volume import ReflectionVolume
+from catacaustics.reflectors.volume import ReflectionVolume, build_volume
+from catacaustics.training import selection
 from catacaustics.training.initialize import named_reflectors
-from catacaustics.training.selection import LADDER, LEAST_GAIN, best, gain
+from catacaustics.training.selection import LADDER, LEAST_GAIN, Trial, best, choose_models, gain
 from catacaustics.training.train import train
 
 
@@ -82,3 +84,23 @@ def test_a_capture_without_masks_trains_the_primary_cloud_alone(tmp_path, capsys
     scene = train(TrainConfig(capture, tmp_path / "run", iterations=4, image_size=64, environment_width=20))
     assert "no reflector" in capsys.readouterr().out
     assert len(scene.reflections) == 0
+
+
+def test_a_short_training_does_not_try_networks_and_says_so(tmp_path, monkeypatch, capsys):
+    capture = open_capture(make_toy_capture(tmp_path / "capture"))
+    tried = []
+
+    def run(trials, name, question, settings):
+        tried.append(name)
+        score = 30.0 if name == "sphere" else 20.0
+        return Trial(name, question, settings, 1.0, 80, 100, 10, [[score, score]], [score, score])
+
+    monkeypatch.setattr(selection._Trials, "run", run)
+    config = TrainConfig(capture.root, tmp_path / "run", minutes=4.0)
+    config.run.mkdir()
+    chosen = choose_models(capture, [build_volume(capture, name) for name in capture.reflectors], config)
+    assert chosen.model == ("sphere",)
+    assert "plane" in tried
+    assert not {"neural", "quadric+neural"} & set(tried)
+    assert "neural and quadric+neural are not tried" in capsys.readouterr().out
+    assert "Not tried" in (config.run / "model_choice.html").read_text()

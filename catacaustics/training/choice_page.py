@@ -42,6 +42,8 @@ def choice_html(folder: Path, result: dict[str, Any], least_gain: float) -> str:
         f"the best so far exceeds both {least_gain:g} dB and twice the standard error of the gain per view. Scores are "
         "means over training views that the trials did not see; every trial had the same number of steps."
     )
+    if result["untried"]:
+        rule += f" Not tried, because the training is too short for a network: {', '.join(result['untried'])}."
     sections = []
     for question, (title, measure) in _TITLES.items():
         rows = [t for t in trials if t["question"] == question]

@@ -29,6 +29,9 @@ from catacaustics.training.photographs import photograph, scaled_camera
 LADDER = ("none", "static", "plane", "sphere", "ellipsoid", "concave", "neural", "quadric+neural")
 """Rungs from the simplest to the most complex."""
 
+_NETWORKS = ("neural", "quadric+neural")
+"""Left out where there are less than `_PATIENT` minutes: trials would be too short for a network to learn anything."""
+
 LEAST_GAIN = 0.2
 """dB that a more complex candidate must gain at least."""
 
@@ -39,7 +42,7 @@ _SIZE, _PATCH = 200, 100
 _FACTORS = (0.5, 1.0, 2.0)
 """Sizes of a cloud that are tried, in units of `usual_points`."""
 _PATIENT = 10
-"""Minutes of training from which on sizes of clouds and corrections of the photographs are tried."""
+"""Minutes of training from which on networks, sizes of clouds and corrections of the photographs are tried."""
 _VIEWS = 8
 """Validation views at most."""
 
@@ -100,13 +103,16 @@ def choose_models(capture: Capture, volumes: list[ReflectionVolume], config: Tra
     if not any(r.model == "auto" for r in reflectors):
         return config
     trials = _Trials(capture, volumes, config)
-    rungs = [trials.run(rung, "model", {"model": _filled(reflectors, rung)}) for rung in LADDER]
+    hurried = _hurried(config)  # no networks, usual sizes, photographs as they are
+    ladder = [rung for rung in LADDER if not (hurried and rung in _NETWORKS)]
+    if hurried:
+        print(f"model selection: less than {_PATIENT} minutes, so {' and '.join(_NETWORKS)} are not tried")
+    rungs = [trials.run(rung, "model", {"model": _filled(reflectors, rung)}) for rung in ladder]
     models = [
-        LADDER[best([trial.inside[i] for trial in rungs])] if r.model == "auto" else r.model
+        ladder[best([trial.inside[i] for trial in rungs])] if r.model == "auto" else r.model
         for i, r in enumerate(reflectors)
     ]
     chosen: dict = {"model": tuple(models)}
-    hurried = _hurried(config)  # usual sizes, photographs as they are
     taken = {"model": models}
     if config.environment_width:
         without = trials.run("no environment map", "environment", chosen | {"environment_width": 0})
@@ -124,7 +130,7 @@ def choose_models(capture: Capture, volumes: list[ReflectionVolume], config: Tra
         taken[question] = [done[index].name]
         chosen[field] = int(_FACTORS[index] * usual_points(capture, volumes, config)[field])
     chosen |= {} if hurried else _photographs(trials, config, chosen, taken)
-    trials.finish(chosen, taken, [v.name for v in volumes])
+    trials.finish(chosen, taken, [v.name for v in volumes], [rung for rung in LADDER if rung not in ladder])
     minutes = None if config.minutes is None else max(config.minutes - trials.seconds / 60, 0.25 * config.minutes)
     return replace(config, minutes=minutes, **chosen)
 
@@ -212,12 +218,13 @@ class _Trials:
         write_json(self.run_folder / "model_choice.json", {"key": self._key, "trials": [asdict(t) for t in self.done]})
         return trial
 
-    def finish(self, chosen: dict, taken: dict[str, list[str]], reflectors: list[str]) -> None:
+    def finish(self, chosen: dict, taken: dict[str, list[str]], reflectors: list[str], untried: list[str]) -> None:
         result = {
             "key": self._key,
             "chosen": _plain(chosen),
             "taken": taken,
             "reflectors": reflectors,
+            "untried": untried,
             "trials": [asdict(t) for t in self.done],
         }
         write_json(self.run_folder / "model_choice.json", result)
