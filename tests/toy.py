@@ -3,6 +3,7 @@ scenes of it that training has not touched."""
 
 import functools
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import torch
@@ -17,7 +18,8 @@ from catacaustics.points import PointCloud, write_ply
 from catacaustics.reflectors.volume import build_volume
 from catacaustics.scene import Scene
 from catacaustics.splatting import splat_points
-from catacaustics.training.initialize import initial_scene, named_reflectors, primary_seeds, reflection_seeds
+from catacaustics.training import initialize
+from catacaustics.training.initialize import named_reflectors, primary_seeds, reflection_seeds
 
 BALL_CENTER = np.array([0.0, -0.35, 0.0])
 BALL_RADIUS = 0.35
@@ -90,7 +92,8 @@ def scene_of(capture: Capture, model: str) -> Scene:
     reflectors = named_reflectors([build_volume(capture, "ball")], config.model)
     rng = np.random.default_rng(0)
     seeds = [primary_seeds(capture, reflectors, config, rng), reflection_seeds(capture, reflectors[0], config, rng)]
-    scene = initial_scene(capture, reflectors, seeds, 1.0, config)
+    with mock.patch.object(initialize, "start_shapes"):  # fitting shapes to photographs takes seconds
+        scene = initialize.initial_scene(capture, reflectors, seeds, 1.0, config)
     with torch.no_grad():
         scene.primary.opacity_logits.fill_(8.0)  # opaque, so that nothing shines through
         scene.reflections[0].features[:, :3] = torch.rand(800, 3, generator=torch.Generator().manual_seed(0))
