@@ -465,7 +465,7 @@ class RefractTrainConfig:
     """Train a refraction model: its R-buffer generator on coordinates, then its renderer with the generator frozen.
 
     The defaults are for minutes on a CPU. The papers: --size paper --crop 0 --lr-generator 7.5e-5 --lr-renderer 1e-4
-    --lr-final-share 1, for hours on a GPU.
+    --lr-final-share 1 --weight-normal 2, for hours on a GPU.
     """
 
     data: Path
@@ -491,12 +491,12 @@ class RefractTrainConfig:
     """Optimiser steps of each part, at most."""
     clock: Literal["wall", "cpu"] = "wall"
     """What minutes are measured by; cpu: processor time of this process, fair where others use the machine too."""
-    batch: int = 4
+    batch: int = 2
     crop: int = 64
     """Side of the square training crops in pixels; 0 takes whole images."""
     glass_share: float = 0.8
     """Share of the crops centred on a refractive pixel; the others are anywhere."""
-    lr_generator: float = 2e-3
+    lr_generator: float = 4e-3
     lr_renderer: float = 2e-3
     lr_final_share: float = 0.01
     """Rates fall to this share of their start along a half cosine; 1 keeps them."""
@@ -505,9 +505,13 @@ class RefractTrainConfig:
     weight_tv: float = 1.5e-8
     """Total variation of coordinates, summed over an image."""
     weight_index: float = 1.0
-    weight_normal: float = 2.0
+    weight_normal: float = 0.2
+    """Normals at the landing points (papers: 2, which in a short training leaves the coordinates behind)."""
     weight_l1: float = 1.0
     weight_dssim: float = 1.0
+    precision: Literal["auto", "float32", "bfloat16"] = "auto"
+    """Of the training's convolutions; auto takes bfloat16 where the processor or GPU computes with it. Trained networks
+    are always run in float32."""
     content: Literal["both", "color", "normal"] = "both"
     """What the renderer gets of the R-buffer."""
     cache_gb: float = 4.0

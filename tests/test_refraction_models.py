@@ -16,9 +16,9 @@ from catacaustics.refraction import models as m
 from catacaustics.refraction import train as training
 from catacaustics.refraction.buffers import BufferCache, frame_buffers, frame_screen, stack
 from catacaustics.refraction.frames import open_frames, write_shard
-from catacaustics.refraction.lookup import Textures, inside_screen, project, sample_screen, visibility
+from catacaustics.refraction.lookup import Textures, inside_screen, project, sample_screen, snap, visibility
 from catacaustics.refraction.measures import landing_regions
-from catacaustics.refraction.networks import SIZES, ObjectEncoder
+from catacaustics.refraction.networks import SIZES, ObjectEncoder, exit_guesses, refract
 
 SMALL = {"steps": 8, "batch": 2, "crop": 16, "checkpoint_minutes": 1e-9}
 
@@ -90,6 +90,23 @@ def test_a_point_behind_another_is_not_visible_and_one_on_it_is(smooth_frame):
     assert visibility(screen.depth, ndc, depth + 0.075, 0.05)[inner].mean() == pytest.approx(0.5, abs=0.05)
 
 
+def test_points_snap_along_their_ray_to_what_the_camera_sees_and_stay_where_that_is_far(smooth_frame):
+    frame, _ = smooth_frame
+    buffers, screen = frame_buffers(frame), frame_screen(frame)
+    seen = torch.from_numpy(landing_regions(frame)["seen"])
+    start = buffers.objects[:, :, 1:4].sum(1)  # the toy's balls stand apart
+    alone = seen & (buffers.objects[0, :, 0].sum(0) == 1)
+    ray = torch.nn.functional.normalize(buffers.landing - start, dim=1)
+    for error in (-0.1, 0.15):
+        snapped = snap(buffers.landing + error * ray, start, buffers.world_to_clip, screen.depth, 0.3)
+        miss = (snapped - buffers.landing).norm(dim=1)[0][alone]
+        assert miss.median() < 0.005
+        assert miss.mean() < 0.03
+    far = buffers.landing - 0.5 * ray
+    stayed = (snap(far, start, buffers.world_to_clip, screen.depth, 0.3) - far).norm(dim=1)[0][alone]
+    assert stayed.median() == 0
+
+
 def test_texture_lookup_is_bilinear_repeats_and_is_exact_at_texel_centres():
     image = np.random.default_rng(0).integers(0, 256, (5, 7, 3), dtype=np.uint8)
     textures = Textures([np.full((1, 1, 3), 51, np.uint8), image])
@@ -113,15 +130,15 @@ def test_hybrid_takes_the_screen_where_the_point_is_seen_and_the_texture_elsewhe
     white = screen._replace(color=torch.ones_like(screen.color))
     textures = Textures(gray)
     perfect = m.truth("hybrid", buffers, 5)
-    color = m.landing_color("hybrid", perfect, buffers.world_to_clip, white, textures)[0, 0].numpy()
+    color = m.landing_color("hybrid", perfect, buffers, white, textures)[0, 0].numpy()
     regions = landing_regions(frame)
     assert regions["off screen"].sum() > 10
     assert np.median(color[regions["seen"]]) == 1
     assert color[regions["off screen"]] == pytest.approx(0.4, abs=1e-5)
-    hidden = m.landing_color(
-        "hybrid", perfect, buffers.world_to_clip, white._replace(depth=screen.depth - 0.5), textures
-    )[0, 0].numpy()
-    assert hidden[regions["seen"]] == pytest.approx(0.4, abs=1e-5)
+    hidden = m.landing_color("hybrid", perfect, buffers, white._replace(depth=screen.depth - 0.5), textures)[
+        0, 0
+    ].numpy()
+    assert (np.abs(hidden[regions["seen"]] - 0.4) < 1e-5).mean() > 0.9
 
 
 @pytest.mark.parametrize("kind", ["uv", "world", "screen", "hybrid"])
@@ -134,13 +151,39 @@ def test_a_perfect_prediction_has_no_loss_but_total_variation_and_finds_the_righ
     losses = m.generator_losses(kind, perfect, buffers)
     assert sum(v for k, v in losses.items() if k != "tv") < 1e-5
     assert 0 < losses["tv"] < 1e-3
-    color = m.landing_color(kind, perfect, buffers.world_to_clip, screen, textures)
+    color = m.landing_color(kind, perfect, buffers, screen, textures)
     right = textures.sample(buffers.landing_object, buffers.landing_uv)
     seen = torch.from_numpy(landing_regions(frame)["seen"])
     assert 255 * (color - right).abs().mean(1)[0][seen].mean() < 1
 
 
 # Networks --------------------------------------------------------------------------------------------------------
+
+
+def pixel(vector):
+    return torch.tensor(vector, dtype=torch.float32).view(1, -1, 1, 1)
+
+
+def test_refraction_follows_snell_and_grazes_beyond_the_critical_angle():
+    for degrees in (0, 20, 50):
+        sine = np.sin(np.radians(degrees))
+        bent = refract(pixel([sine, 0, -np.cos(np.radians(degrees))]), pixel([0, 0, 1]), pixel([1 / 1.5])).flatten()
+        assert bent[0] == pytest.approx(sine / 1.5, abs=1e-6)
+        assert bent.norm() == pytest.approx(1, abs=1e-6)
+    grazing = refract(pixel([0.9, 0, -np.sqrt(1 - 0.81)]), pixel([0, 0, 1]), pixel([1.5])).flatten()
+    assert grazing[2] == pytest.approx(0, abs=1e-3)
+
+
+def test_the_guess_of_a_ball_is_the_deviation_of_a_ball_and_a_sheet_with_flat_faces_bends_nothing():
+    incidence, ior = np.radians(40), 1.5
+    ray = pixel([0, 0, -1])
+    normal = pixel([np.sin(incidence), 0, np.cos(incidence)])
+    ball = exit_guesses(ray, normal, pixel([ior]), pixel([0, 0, 1])).ball.flatten()
+    deviation = 2 * (incidence - np.arcsin(np.sin(incidence) / ior))
+    assert ball.tolist() == pytest.approx([-np.sin(deviation), 0, -np.cos(deviation)], abs=1e-5)
+    flat = exit_guesses(ray, normal, pixel([ior]), normal).sheet
+    torch.testing.assert_close(flat, ray, atol=1e-5, rtol=0)
+    assert torch.equal(exit_guesses(ray, 0 * ray, pixel([0]), 0 * ray).ball, ray)
 
 
 @pytest.mark.parametrize("name", list(m.MODELS))
@@ -152,7 +195,8 @@ def test_no_order_of_four_objects_changes_the_image(name):
     with torch.no_grad():
         first = model(buffers, screen)
         for order in itertools.permutations(range(4)):
-            other = model(buffers._replace(objects=buffers.objects[:, list(order)]), screen)
+            own = [getattr(buffers, name)[:, list(order)] for name in ("objects", "poses")]
+            other = model(buffers._replace(objects=own[0], poses=own[1]), screen)
             assert (other - first).abs().max() < 1e-5
 
 
@@ -160,17 +204,16 @@ def test_no_order_of_four_objects_changes_the_image(name):
 def test_an_object_out_of_view_changes_nothing(name):
     frame = toy_frame(np.random.default_rng(8), balls=2)
     buffers, screen = frame_buffers(frame), frame_screen(frame)
-    absent = torch.zeros_like(buffers.objects[:, :1])
+    more = [torch.cat([0 * x[:, :1], x, 0 * x[:, :1]], 1) for x in (buffers.objects, buffers.poses)]
     model = fresh_model(name)
     with torch.no_grad():
-        more = model(buffers._replace(objects=torch.cat([absent, buffers.objects, absent], 1)), screen)
-        assert torch.equal(more, model(buffers, screen))
+        assert torch.equal(model(buffers._replace(objects=more[0], poses=more[1]), screen), model(buffers, screen))
 
 
 def test_the_encoder_gives_exactly_zero_for_an_object_out_of_view_also_after_training(trained):
     _, model = trained
     buffers = frame_buffers(toy_frame(np.random.default_rng(8), balls=1))
-    empty = buffers._replace(objects=torch.zeros_like(buffers.objects))
+    empty = buffers._replace(objects=0 * buffers.objects, poses=0 * buffers.poses)
     for encoder in (model.generator.objects, model.renderer.objects):
         assert encoder(empty).abs().max() == 0
         assert encoder(buffers).abs().max() > 0

@@ -19,7 +19,7 @@ OBJECT_CHANNELS = 9
 
 
 class Buffers(NamedTuple):
-    """Frames, channels first; k is the largest number of transparent objects, missing ones are all zero."""
+    """Frames, channels first; k is the largest number of transparent objects, at least 1, missing ones are all zero."""
 
     reference: Float[Tensor, "b 3 h w"]
     position: Float[Tensor, "b 3 h w"]
@@ -36,6 +36,9 @@ class Buffers(NamedTuple):
     landing_uv: Float[Tensor, "b 2 h w"]
     landing_normal: Float[Tensor, "b 3 h w"]
     landing_object: Int[Tensor, "b h w"]
+    poses: Float[Tensor, "b k 6"]
+    """Mean position and mean normal of each object's seen part in the whole image: roughly where it is and how it
+    stands. Zero where it is not seen."""
     world_to_clip: Float[Tensor, "b 4 4"]
 
     @property
@@ -47,7 +50,7 @@ class Buffers(NamedTuple):
     def crop(self, y: int, x: int, side: int) -> "Buffers":
         """A square part of the images."""
         window = (..., slice(y, y + side), slice(x, x + side))
-        return Buffers(*(value[window] for value in self[:-1]), self.world_to_clip)
+        return Buffers(*(value[window] for value in self[:-2]), *self[-2:])
 
     def to(self, device: torch.device | str) -> "Buffers":
         return Buffers(*(value.to(device) for value in self))
@@ -64,6 +67,9 @@ def frame_buffers(frame: Frame) -> Buffers:
     ior = frame.object_ior[:, None, None, None] * mask
     parts = [mask, frame.object_position, frame.object_normal, frame.object_depth[..., None], ior]
     objects = np.concatenate(parts, -1, dtype=np.float32) * mask
+    if not len(objects):
+        objects = np.zeros((1, *objects.shape[1:]), np.float32)
+    poses = objects[..., 1:7].sum((1, 2)) / np.maximum(objects[..., :1].sum((1, 2)), 1)
     return Buffers(
         reference=image(frame.reference),
         position=image(frame.position),
@@ -79,6 +85,7 @@ def frame_buffers(frame: Frame) -> Buffers:
         landing_uv=image(frame.landing_uv),
         landing_normal=image(frame.landing_normal),
         landing_object=torch.from_numpy(frame.landing_object.astype(np.int64))[None],
+        poses=torch.from_numpy(poses)[None],
         world_to_clip=torch.from_numpy(frame.world_to_clip)[None],
     )
 
@@ -104,7 +111,11 @@ def _rays(frame: Frame) -> Float[np.ndarray, "h w 3"]:
 def stack(parts: Sequence[Buffers]) -> Buffers:
     """Join along b; frames with fewer transparent objects get objects that are nowhere seen."""
     most = max(part.objects.shape[1] for part in parts)
-    parts = [p._replace(objects=pad(p.objects, (0, 0) * 3 + (0, most - p.objects.shape[1]))) for p in parts]
+    more = [most - part.objects.shape[1] for part in parts]
+    parts = [
+        p._replace(objects=pad(p.objects, (0, 0) * 3 + (0, n)), poses=pad(p.poses, (0, 0, 0, n)))
+        for p, n in zip(parts, more, strict=True)
+    ]
     return Buffers(*(torch.cat(values) for values in zip(*parts, strict=True)))
 
 

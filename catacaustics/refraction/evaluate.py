@@ -99,7 +99,7 @@ def evaluate(config: RefractEvaluateConfig) -> dict[str, Any]:
 
 def render_frame(model: RefractionModel, frame: Frame, content: str = "both") -> View:
     """A frame's image, the colours it looked up and the true ones."""
-    device = next(model.parameters()).device
+    device = model.device
     buffers, screen = _inputs(frame, device)
     with torch.no_grad():
         baked = model.bake(buffers, screen)
@@ -107,7 +107,7 @@ def render_frame(model: RefractionModel, frame: Frame, content: str = "both") ->
         looked_up = None
         prediction = model.predict(buffers)
         if prediction is not None and model.kind is not None:
-            looked_up = landing_color(model.kind, prediction, buffers.world_to_clip, screen, model.textures)
+            looked_up = landing_color(model.kind, prediction, buffers, screen, model.textures)
             looked_up = _picture_of(looked_up * buffers.covered)
         true_color = model.textures.sample(buffers.landing_object, buffers.landing_uv)
     return View(_picture_of(image), looked_up, _picture_of(true_color))
@@ -124,7 +124,7 @@ def _picture_of(image: Tensor) -> np.ndarray:
 def measure_speed(model: RefractionModel, frames: Frames) -> dict[str, Any]:
     """Milliseconds a frame (generator, lookups and renderer; median, buffers in memory), parameters, and the most
     memory that one frame takes beside weights and inputs, in MiB."""
-    device = next(model.parameters()).device
+    device = model.device
     inputs = [_inputs(frames[i], device) for i in range(min(_TIMED_FRAMES, len(frames)))]
     seconds = []
     with torch.no_grad():
@@ -149,7 +149,7 @@ def measure_speed(model: RefractionModel, frames: Frames) -> dict[str, Any]:
 
 def _peak_memory(model: RefractionModel, inputs: tuple[Buffers, Screen]) -> int:
     """Most bytes of tensors that are alive at a time while one frame is rendered."""
-    device = next(model.parameters()).device
+    device = model.device
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
         before = torch.cuda.memory_allocated(device)

@@ -55,6 +55,38 @@ def visibility(
     return (2 - difference / tolerance).clamp(0, 1)
 
 
+def snap(
+    points: Float[Tensor, "b 3 h w"],
+    origins: Float[Tensor, "b 3 h w"],
+    world_to_clip: Float[Tensor, "b 4 4"],
+    screen_depth: Float[Tensor, "b 1 s s"],
+    reach: float,
+    steps: int = 24,
+) -> Float[Tensor, "b 3 h w"]:
+    """Move points along their ray to where it meets the surface that the camera sees, at most by `reach` (scene units).
+
+    The ray is followed from point - reach to point + reach; of the places where it goes below the surface the one
+    nearest to the point is taken, found by linear interpolation. Points without such a place stay.
+    """
+    distance = (points - origins).norm(dim=1, keepdim=True)
+    ray = (points - origins) / distance.clamp_min(1e-6)
+    low = (distance - reach).clamp_min(0)
+    step = (distance + reach - low) / steps
+    best, shift = torch.full_like(distance, torch.inf), torch.zeros_like(distance)
+    before: Tensor | None = None
+    for i in range(steps + 1):
+        ndc, depth = project(origins + (low + i * step) * ray, world_to_clip)
+        below = depth - sample_screen(screen_depth, ndc)
+        if before is not None:
+            # Far below means that the ray has gone behind something, not into it.
+            meets = (before < 0) & (below >= 0) & (below < 2 * step) & (inside_screen(ndc) > 0)
+            moved = low + (i - below / (below - before).clamp_min(1e-6)) * step - distance
+            nearer = meets & (moved.abs() < best)
+            best, shift = torch.where(nearer, moved.abs(), best), torch.where(nearer, moved, shift)
+        before = below
+    return points + shift * ray
+
+
 class Textures:
     """The textures of a scene's opaque objects for bilinear lookup by texture coordinates, which repeat.
 

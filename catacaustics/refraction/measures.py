@@ -122,9 +122,9 @@ def mean_rows(rows: list[dict[str, Any]]) -> dict[str, float]:
     return {key: float(np.mean([row[key] for row in rows if key in row])) for key in keys}
 
 
-def pool_regions(parts: list[dict[str, Region]], r_buffer: bool) -> dict[str, dict[str, float]]:
+def pool_regions(parts: list[dict[str, Region]], r_buffer: bool) -> dict[str, dict[str, float | int]]:
     """T.L1, R.L1 and share of pixels of each region, pooled over all frames; a region without pixels is left out."""
-    pooled = {}
+    pooled: dict[str, dict[str, float | int]] = {}
     for name in parts[0]:
         total = Region(*(sum(values) for values in zip(*(part[name] for part in parts), strict=True)))
         if total.pixels:

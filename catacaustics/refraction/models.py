@@ -15,8 +15,8 @@ from catacaustics.files import read_tensors, write_tensors
 from catacaustics.losses import total_variation
 from catacaustics.refraction.buffers import Buffers
 from catacaustics.refraction.frames import Frames
-from catacaustics.refraction.lookup import Screen, Textures, inside_screen, project, sample_screen, visibility
-from catacaustics.refraction.networks import SIZES, Generator, Renderer
+from catacaustics.refraction.lookup import Screen, Textures, inside_screen, project, sample_screen, snap, visibility
+from catacaustics.refraction.networks import SIZES, Generator, Renderer, nearest_object
 from catacaustics.shapes import Bool, Float, Int, UInt8
 
 FORMAT = 1
@@ -37,8 +37,9 @@ R_CHANNELS = 6
 """Colour and normal at the landing point."""
 _FAR_NDC = 2.0
 """Screen coordinates are learned up to here; what lands farther outside the image counts as landing there."""
-EDGE, TOLERANCE = 0.02, 0.05
-"""hybrid: softness at the image's border (ndc) and of the occlusion test (scene units)."""
+EDGE, TOLERANCE, REACH = 0.02, 0.05, 0.3
+"""hybrid: softness at the image's border (ndc) and of the occlusion test, and how far points are moved along their ray
+onto what the camera sees (scene units)."""
 
 
 class Prediction(NamedTuple):
@@ -153,14 +154,15 @@ def _masked_l1(
 def landing_color(
     kind: Kind,
     prediction: Prediction,
-    world_to_clip: Float[Tensor, "b 4 4"],
+    buffers: Buffers,
     screen: Screen | None,
     textures: Textures,
 ) -> Float[Tensor, "b 3 h w"]:
     """Colour (albedo, sRGB-encoded) at the predicted landing points.
 
     uv: bilinear in the texture of the most probable object. world: p_ndc = (P V p)_xyz / (P V p)_w, bilinear in the
-    screen-space colour buffer, clamped to its border. hybrid: as world where the point is on the screen and its depth
+    screen-space colour buffer, clamped to its border. hybrid: points are first moved along their ray from the glass
+    onto the surface that the camera sees, if that is near; then as world where the point is on the screen and its depth
     is the screen's, as uv elsewhere, with a soft step between.
     """
     by_uv = by_screen = None
@@ -173,7 +175,10 @@ def landing_color(
     if prediction.ndc is not None:
         return sample_screen(screen.color, prediction.ndc)
     assert prediction.world is not None
-    ndc, depth = project(prediction.world, world_to_clip)
+    world = prediction.world
+    if kind == "hybrid":
+        world = snap(world, nearest_object(buffers)[0][:, 1:4], buffers.world_to_clip, screen.depth, REACH)
+    ndc, depth = project(world, buffers.world_to_clip)
     by_screen = sample_screen(screen.color, ndc)
     if by_uv is None:
         return by_screen
@@ -185,7 +190,7 @@ def r_buffer(
     kind: Kind, prediction: Prediction, buffers: Buffers, screen: Screen | None, textures: Textures
 ) -> Float[Tensor, "b 6 h w"]:
     """Colour and normal at the landing points, zero where no transparent object is seen."""
-    color = landing_color(kind, prediction, buffers.world_to_clip, screen, textures)
+    color = landing_color(kind, prediction, buffers, screen, textures)
     return torch.cat([color, prediction.normal], 1) * buffers.covered
 
 
@@ -258,6 +263,10 @@ class RefractionModel(nn.Module):
         self.generator = new_generator(self.kind, size, len(textures)).to(device) if self.kind else None
         self.renderer = new_renderer(self.kind, size).to(device)
 
+    @property
+    def device(self) -> torch.device:
+        return self.textures.texels.device
+
     def predict(self, buffers: Buffers) -> Prediction | None:
         """The generator's output; None for glassnet."""
         return split_output(self.kind, self.generator(buffers)) if self.generator and self.kind else None
@@ -275,7 +284,8 @@ class RefractionModel(nn.Module):
 
 
 def new_generator(kind: Kind, size: str, textures: int) -> Generator:
-    return Generator(output_channels(kind, textures), SIZES[size]).to(memory_format=torch.channels_last)
+    world = kind in ("world", "hybrid")
+    return Generator(output_channels(kind, textures), SIZES[size], world).to(memory_format=torch.channels_last)
 
 
 def new_renderer(kind: Kind | None, size: str) -> Renderer:

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import interpolate, relu
+from torch.nn.functional import interpolate, normalize, relu, softplus
 
 from catacaustics.refraction.buffers import OBJECT_CHANNELS, Buffers
 from catacaustics.shapes import Float
@@ -43,6 +43,12 @@ def _conv(inputs: int, outputs: int, side: int = 3, stride: int = 1) -> nn.Conv2
     return conv
 
 
+def _precise(layer: nn.Module, x: Tensor) -> Tensor:
+    """A layer in float32, also where others compute with less: its result is coordinates or colours."""
+    with torch.autocast(x.device.type, enabled=False):
+        return layer(x.float())
+
+
 class UNet(nn.Module):
     """Encoder and decoder with skips. Level i has width * min(2^i, 4) channels; the result has `width`."""
 
@@ -69,6 +75,46 @@ class UNet(nn.Module):
         return x
 
 
+class Guesses(NamedTuple):
+    """Directions of a ray in and behind an object, as far as its first surface tells; unit length."""
+
+    inside: Float[Tensor, "b 3 h w"]
+    ball: Float[Tensor, "b 3 h w"]
+    """Behind it, were the object a ball."""
+    sheet: Float[Tensor, "b 3 h w"]
+    """Behind it, were its back the mirror image of its front."""
+
+
+def refract(
+    directions: Float[Tensor, "b 3 h w"], normals: Float[Tensor, "b 3 h w"], ratio: Float[Tensor, "b 1 h w"]
+) -> Float[Tensor, "b 3 h w"]:
+    """Snell's law in vectors; `ratio` of the indices before and behind, normals against the ray. Beyond the critical
+    angle the ray grazes the surface."""
+    cosine = -(directions * normals).sum(1, keepdim=True)
+    along = (1 - ratio**2 * (1 - cosine**2)).clamp_min(0).sqrt()
+    return ratio * directions + (ratio * cosine - along) * normals
+
+
+def exit_guesses(
+    rays: Float[Tensor, "b 3 h w"],
+    normal: Float[Tensor, "b 3 h w"],
+    ior: Float[Tensor, "b 1 h w"],
+    mean_normal: Float[Tensor, "b 3 h w"],
+) -> Guesses:
+    """Where rays go that meet a surface of this normal.
+
+    Args:
+        ior: of the object; 0 where there is none: the ray goes on.
+        mean_normal: of the object's seen part, unit length.
+    """
+    ior = torch.where(ior > 0, ior, 1.0)
+    inside = refract(rays, normal, 1 / ior)
+    # Outward normals where the ray leaves: a ball's, by symmetry of the chord, and the mirrored front's.
+    ball = normal - 2 * (inside * normal).sum(1, keepdim=True) * inside
+    sheet = normal - 2 * (normal * mean_normal).sum(1, keepdim=True) * mean_normal
+    return Guesses(inside, *(refract(inside, -back, ior) for back in (ball, sheet)))
+
+
 class ObjectEncoder(nn.Module):
     """Sum over the transparent objects of one shared network's features (GlassNet: k(sum h(x_k))).
 
@@ -78,37 +124,67 @@ class ObjectEncoder(nn.Module):
     def __init__(self, size: Size):
         super().__init__()
         self.octaves = size.octaves
-        inputs = OBJECT_CHANNELS + 3 * 2 * size.octaves + 3
+        inputs = OBJECT_CHANNELS + 3 * 2 * size.octaves + 3 + 3 * 3 + 3 * 5 + 3
         self.first, self.second = _conv(inputs, size.width, 1), _conv(size.width, size.width, 1)
 
     def forward(self, buffers: Buffers) -> Float[Tensor, "b c h w"]:
         b, k = buffers.objects.shape[:2]
-        objects = buffers.objects.flatten(0, 1)
-        mask, position, rest = objects[:, :1], objects[:, 1:4], objects[:, 4:]
+        objects, poses = buffers.objects.flatten(0, 1), buffers.poses.flatten(0, 1)[..., None, None]
+        mask, position, normal, ior = objects[:, :1], objects[:, 1:4], objects[:, 4:7], objects[:, 8:]
         rays = buffers.rays.repeat_interleave(k, 0)
-        x = _join(mask, encode(position, self.octaves), rest, rays)
+        mean_normal = normalize(poses[:, 3:], dim=1).expand_as(normal)
+        guesses = exit_guesses(rays, normal, ior, mean_normal)
+        own = encode(4 * (position - poses[:, :3]), 2)  # where on the object
+        x = _join(mask, encode(position, self.octaves), objects[:, 4:], rays, *guesses, own, mean_normal)
         x = relu(self.second(relu(self.first(x)))) * mask
         # Summed in float64: rounding then depends on the order only far below float32's last digit.
         return x.unflatten(0, (b, k)).sum(1, dtype=torch.float64).to(x.dtype)
 
 
-class Generator(nn.Module):
-    """R-buffer generator: objects and opaque geometry in, `outputs` channels of coordinates, logits, normals out."""
+def nearest_object(buffers: Buffers) -> tuple[Float[Tensor, "b 9 h w"], Float[Tensor, "b 3 h w"]]:
+    """Each pixel's nearest transparent object: its buffers, zero where there is none, and its unit mean normal."""
+    objects = buffers.objects
+    depth = torch.where(objects[:, :, 0] > 0, objects[:, :, 7], torch.inf)
+    index = depth.argmin(1)
+    nearest = torch.take_along_dim(objects, index[:, None, None], 1)[:, 0]
+    normals = normalize(buffers.poses[:, :, 3:], dim=2)[..., None, None]
+    return nearest, torch.take_along_dim(normals, index[:, None, None], 1)[:, 0] * nearest[:, :1]
 
-    def __init__(self, outputs: int, size: Size):
+
+class Generator(nn.Module):
+    """R-buffer generator: objects and opaque geometry in, `outputs` channels of normals, coordinates, logits out.
+
+    World coordinates, channels 3 to 5 with `world`, are found as first surface + distance * direction: how a ray is
+    bent is a smooth function that knows nothing of the scene behind, unlike the point where it lands. The direction is
+    a mixture of the ray and the guesses of `exit_guesses`, plus what the network adds.
+    """
+
+    def __init__(self, outputs: int, size: Size, world: bool):
         super().__init__()
-        self.octaves = size.octaves
+        self.octaves, self.outputs, self.world = size.octaves, outputs, world
         self.objects = ObjectEncoder(size)
-        self.trunk = UNet(size.width + 3 * (1 + 2 * size.octaves) + 3 + 1 + 3, size)
-        self.head = nn.Sequential(_conv(size.width + size.width, 2 * size.width, 1), nn.ReLU())
-        self.last = nn.Conv2d(2 * size.width, outputs, 1)
+        self.trunk = UNet(size.width + 3 * (1 + 2 * size.octaves) + 3 + 1 + 4 * 3, size)
+        self.head = nn.Sequential(_conv(2 * size.width + 4 * 3, 2 * size.width, 1), nn.ReLU())
+        self.last = nn.Conv2d(2 * size.width, outputs + 5 * world, 1)
+        self.last.weight.data *= 0.1
         nn.init.zeros_(self.last.bias)
+        if world:
+            self.last.bias.data[-5:-3] = torch.tensor([0.5, 1.0])  # at the start the ray goes straight on
 
     def forward(self, buffers: Buffers) -> Float[Tensor, "b outputs h w"]:
         objects = self.objects(buffers)
-        geometry = [encode(buffers.position, self.octaves), buffers.normal, buffers.depth, buffers.rays]
-        x = self.trunk(_join(objects, *geometry))
-        return self.last(self.head(_join(x, objects)))
+        nearest, mean_normal = nearest_object(buffers)
+        guesses = exit_guesses(buffers.rays, nearest[:, 4:7], nearest[:, 8:], mean_normal)
+        ways = [buffers.rays, *guesses]
+        geometry = [encode(buffers.position, self.octaves), buffers.normal, buffers.depth]
+        x = self.trunk(_join(objects, *geometry, *ways))
+        x = _precise(self.last, self.head(_join(x, objects, *ways)))
+        if not self.world:
+            return x
+        x, distance, shares = x[:, : self.outputs], softplus(x[:, -5:-4]), x[:, -4:]
+        bent = sum(share * way for share, way in zip(shares.split(1, 1), ways, strict=True))
+        landing = nearest[:, 1:4] + distance * normalize(bent + x[:, 3:6], dim=1)
+        return torch.cat([x[:, :3], landing, x[:, 6:]], 1)
 
 
 class Renderer(nn.Module):
@@ -136,6 +212,6 @@ class Renderer(nn.Module):
         geometry = [encode(buffers.position, self.octaves), buffers.normal, buffers.depth, buffers.rays]
         code = self.reflection(_join(*geometry, buffers.albedo, buffers.direct))
         through = self.transmission(_join(code, self.objects(buffers), r_buffer))
-        out = self.last(relu(self.join(_join(code, through, r_buffer))))
+        out = _precise(self.last, relu(self.join(_join(code, through, r_buffer))))
         image = out[:, :3] + out[:, 3:6] * buffers.direct
         return image + out[:, 6:9] * r_buffer[:, :3] if self.r_channels else image

@@ -66,6 +66,8 @@ class _Part:
     rate: float
     minutes: float | None
     losses: Callable[[Buffers, list[Place]], dict[str, Tensor]]
+    bfloat16: bool
+    """Convolutions compute with bfloat16."""
 
 
 def train(config: RefractTrainConfig) -> RefractionModel:
@@ -86,21 +88,30 @@ def train(config: RefractTrainConfig) -> RefractionModel:
     train_frames, more = frames.split("train"), frames.split("generator")
     cache = BufferCache(ConcatDataset([train_frames, more]), config.cache_gb * 2**30)
     share = config.generator_share if kind else 0.0
+    short = computes_bfloat16(model.device) if config.precision == "auto" else config.precision == "bfloat16"
     if kind and config.part != "renderer" and config.generator is None:
         every = range(len(train_frames) + len(more))
         minutes = config.minutes and config.minutes * share
-        losses = _generator_step(model, config)
-        _fit(model.generator, _Part("generator", every, config.lr_generator, minutes, losses), cache, model, config)
+        part = _Part("generator", every, config.lr_generator, minutes, _generator_step(model, config), short)
+        _fit(model.generator, part, cache, model, config)
     if config.part != "generator":
         if model.generator is not None:
             _take_generator(model, config.generator or run / "generator.safetensors")
             if config.generator is not None:
                 write_bytes(run / "generator.safetensors", config.generator.read_bytes())
         minutes = config.minutes and config.minutes * (1 - share)
-        losses = _renderer_step(model, cache, config)
-        part = _Part("renderer", range(len(train_frames)), config.lr_renderer, minutes, losses)
+        every = range(len(train_frames))
+        part = _Part("renderer", every, config.lr_renderer, minutes, _renderer_step(model, cache, config), short)
         _fit(model.renderer, part, cache, model, config)
     return model.eval()
+
+
+def computes_bfloat16(device: torch.device) -> bool:
+    """Whether bfloat16 is fast: GPUs from Ampere on, processors with AVX-512 BF16 or AMX."""
+    if device.type == "cuda":
+        return torch.cuda.is_bf16_supported(including_emulation=False)
+    able = torch.cpu.get_capabilities() if hasattr(torch.cpu, "get_capabilities") else {}
+    return bool(able.get("avx512_bf16") or able.get("amx_bf16"))
 
 
 def _check(config: RefractTrainConfig, frames: Frames) -> None:
@@ -159,7 +170,7 @@ def _renderer_step(
 ) -> Callable[[Buffers, list[Place]], dict[str, Tensor]]:
     """L1 + DSSIM. The generator is frozen, so every frame's R-buffer is computed once and kept."""
     baked: dict[int, Tensor] = {}
-    device = next(model.renderer.parameters()).device
+    device = model.device
 
     def r_buffer(index: int) -> Tensor:
         if index not in baked:
@@ -168,15 +179,15 @@ def _renderer_step(
                 frame = cache.frames[index]
                 cache.keep(index, frame_buffers(frame))
                 screen = Screen(*(value.to(device) for value in frame_screen(frame)))
-            with torch.no_grad():
+            with torch.no_grad(), torch.autocast(device.type, enabled=False):
                 whole = model.bake(cache.get(index).to(device), screen)
             baked[index] = keep_content(whole, config.content).half().cpu()
         return baked[index]
 
     def losses(batch: Buffers, places: list[Place]) -> dict[str, Tensor]:
         side = batch.reference.shape[-1]
-        parts = [r_buffer(i)[..., y : y + side, x : x + side] for i, y, x in places]
-        image = model.renderer(batch, torch.cat(parts).to(device).float())
+        parts = [r_buffer(i)[..., y : y + side, x : x + side].to(device).float() for i, y, x in places]
+        image = model.renderer(batch, torch.cat(parts))
         error = (image - batch.reference).abs().mean()
         b, c, height, width = image.shape
         planes = (x.permute(2, 3, 0, 1).reshape(height, width, b * c) for x in (image, batch.reference))
@@ -334,7 +345,8 @@ def _step(state: PartState, part: _Part, batch: Buffers, places: list[Place]) ->
         UserError: a value that is not finite; the weights are those before the step.
     """
     state.optimizer.zero_grad(set_to_none=True)
-    losses = part.losses(batch, places)
+    with torch.autocast(batch.depth.device.type, torch.bfloat16, enabled=part.bfloat16):
+        losses = part.losses(batch, places)
     total = torch.stack(list(losses.values())).sum()
     total.backward()
     norm = torch.nn.utils.clip_grad_norm_(state.network.parameters(), _LONGEST_GRADIENT)

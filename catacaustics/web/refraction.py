@@ -133,7 +133,7 @@ def refraction_app(view: RefractionView) -> Starlette:
             raise HTTPException(400, f"values must be {len(view.parameters)} numbers.")
         if shown not in view.state()["shown"]:
             raise HTTPException(400, f"shown must be one of {', '.join(view.state()['shown'])}.")
-        return view.render(values, shown)
+        return view.render([float(value) for value in values], shown)
 
     return Starlette(
         routes=[
