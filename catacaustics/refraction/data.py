@@ -30,8 +30,6 @@ from catacaustics.refraction.variants import VECTORISED, choose_variant
 
 SHARD = 10
 """Frames in a shard, at most."""
-NOISES = 16
-"""Seeds of the sampler: it compiles a kernel for each, half a second, so that frames share them."""
 TRIES = 20
 """Draws of a frame whose camera stands badly."""
 
@@ -53,7 +51,7 @@ def make_frame(scene: Scene, config: RefractDataConfig, split: str, index: int) 
     """
     seeds = np.random.SeedSequence([config.seed, SPLITS.index(split), index])
     stage, camera, share = _stand(scene, np.random.default_rng(seeds), config.resolution)
-    noise = int(seeds.generate_state(1)[0] % NOISES)
+    noise = int(seeds.generate_state(1)[0] >> 1)
     opaque = stage.gbuffer(camera)
     size = (camera.height, camera.width)
     has_reference = split != "generator"

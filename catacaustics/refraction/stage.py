@@ -211,6 +211,7 @@ class Stage:
         return self._rendered(self.opaque, camera, {"type": "direct"}, DIRECT_SAMPLES, 0)
 
     def _rendered(self, scene: Any, camera: Camera, integrator: Any, spp: int, seed: int) -> np.ndarray:
+        import drjit as dr
         import mitsuba as mi
 
         sensor = mi.load_dict(
@@ -234,7 +235,10 @@ class Stage:
                 },
             }
         )
-        image = mi.render(scene, sensor=sensor, integrator=mi.load_dict(integrator), spp=spp, seed=mi.UInt32(seed))
+        # A seed that is no data would be compiled into the kernel.
+        image = mi.render(
+            scene, sensor=sensor, integrator=mi.load_dict(integrator), spp=spp, seed=dr.opaque(mi.UInt32, seed)
+        )
         return np.array(image)
 
     def gbuffer(self, camera: Camera) -> dict[str, np.ndarray]:
