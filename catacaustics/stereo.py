@@ -211,11 +211,14 @@ def stereo(config: StereoConfig) -> None:
     pictures = {"left": left, "right": right, "anaglyph": anaglyph(left, right)}
     for name, picture in (pictures | {"side_by_side": side_by_side(left, right)}).items():
         write_image(out / f"{name}.png", picture)
-    measured = _measured(scene, camera, rig) if scene.volumes else {}
+    measured = _measured(scene, camera, rig)
     settings = {"view": view.name, "separation": rig.separation, "screen": rig.screen, "warp_separation": rig.warp}
     write_json(out / "stereo.json", settings | {"disparity": {k: d._asdict() for k, d in measured.items()}})
     print(f"eyes {rig.separation:.4g} apart, screen at {rig.screen:.4g}; pictures: {out}")
-    _print_table(measured)
+    if measured:
+        _print_table(measured)
+    else:
+        print(f"no reflection is seen in {view.name}, so there are no disparities to compare")
     if config.film is not None:
         cameras = camera_path(run.capture, config.path, frame_count(config.seconds, config.fps), config.width)
         join = side_by_side if config.film == "side-by-side" else anaglyph
@@ -228,12 +231,16 @@ def stereo(config: StereoConfig) -> None:
 
 
 def _measured(scene: Scene, camera: Camera, rig: Rig) -> dict[str, Disparity]:
+    """Disparities before and after, and of the surface; empty where no reflection is seen."""
     full = rig._replace(warp=1.0)
-    return {
-        "full": reflection_disparity(scene, camera, full),
-        "chosen": reflection_disparity(scene, camera, rig),
-        "surface": surface_disparity(scene, camera, full),
-    }
+    try:
+        return {
+            "full": reflection_disparity(scene, camera, full),
+            "chosen": reflection_disparity(scene, camera, rig),
+            "surface": surface_disparity(scene, camera, full),
+        }
+    except UserError:
+        return {}
 
 
 def _print_table(measured: dict[str, Disparity]) -> None:

@@ -150,3 +150,12 @@ def test_the_command_writes_pairs_a_film_and_the_disparities(capture, mirror_bal
     ):
         assert cli.main([*command, *wrong]) == 2
         assert words in capsys.readouterr().err
+
+
+def test_a_scene_without_reflectors_has_pairs_but_no_disparities(capture, mirror_ball, tmp_path, capsys):
+    bare = copy.deepcopy(mirror_ball)
+    bare.volumes, bare.warps, bare.reflections = [], torch.nn.ModuleList(), torch.nn.ModuleList()
+    run = write_run(tmp_path / "run", capture, bare)
+    assert cli.main(["stereo", str(run), str(tmp_path / "out"), "--width", "32"]) == 0
+    assert (tmp_path / "out" / "anaglyph.png").is_file()
+    assert "no reflection is seen" in capsys.readouterr().out

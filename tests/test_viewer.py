@@ -24,7 +24,7 @@ from catacaustics.run import open_run
 from catacaustics.scene import Scene
 from catacaustics.training.initialize import Reflector, initial_scene, primary_seeds, reflection_seeds
 from catacaustics.web import live
-from catacaustics.web.viewer import Viewer, _quaternion, window_camera
+from catacaustics.web.viewer import Viewer, _quaternion, serve, window_camera
 
 CHROMIUM = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
 
@@ -183,6 +183,9 @@ class Looker:
         )
         self.atomic = nullcontext
 
+    def add_notification(self, *_, **__):
+        pass
+
     def set_background_image(self, image, *_, **__):
         self.pictures.append(image)
 
@@ -222,6 +225,34 @@ def test_a_training_is_copied_only_while_somebody_looks_and_shown_as_it_was(capt
         assert view.copies == 2
     finally:
         view.close()
+
+
+def test_an_interrupted_film_of_the_viewer_goes_on(capture, scene, tmp_path, monkeypatch):
+    server, _ = serve(free_port(), browser=False)
+    try:
+        viewer = Viewer(server, scene, capture, tmp_path, 64)
+        looker = Looker(capture.views[0].camera)
+        event = SimpleNamespace(client=looker)
+        viewer._connect(looker)
+        viewer.path = [v.camera.resized(32, 24) for v in capture.views[:2]]
+        viewer.seconds.value, viewer.fps.value = 0.5, 12.0
+        drawn, render = [], viewer.render
+
+        def interrupted(camera):
+            drawn.append(camera)
+            if len(drawn) == 4:
+                raise KeyboardInterrupt
+            return render(camera)
+
+        monkeypatch.setattr(viewer, "render", lambda c: interrupted(c) if c.width == 32 else render(c))
+        with pytest.raises(KeyboardInterrupt):
+            viewer._save_film(event)
+        assert not (tmp_path / "films" / "001.mp4").exists()
+        viewer._save_film(event)
+        assert len(drawn) == 4 + 3  # of six frames three were finished
+        assert (tmp_path / "films" / "001.mp4").read_bytes()[4:8] == b"ftyp"
+    finally:
+        server.stop()
 
 
 def test_watching_takes_its_share_of_the_time_at_most(capture, scene, tmp_path):
