@@ -23,10 +23,11 @@ from catacaustics.geometry import normalize
 from catacaustics.images import write_image
 from catacaustics.refraction.contact import contact_sheet
 from catacaustics.refraction.frames import CARD, SPLITS, Frame, open_frames, sha256_of, shard_problem, write_shard
-from catacaustics.refraction.scenes import Scene, draw, find_scene, ranges, with_ranges
+from catacaustics.refraction.scenes import Scene, at_shares, draw, find_scene, ranges, with_ranges
 from catacaustics.refraction.stage import MAX_DEPTH, Stage, camera_of, camera_rays, srgb, whole_samples, world_to_clip
 from catacaustics.refraction.trace import MAX_EVENTS, land
 from catacaustics.refraction.variants import VECTORISED, choose_variant
+from catacaustics.shapes import Float
 
 SHARD = 10
 """Frames in a shard, at most."""
@@ -52,16 +53,39 @@ def make_frame(scene: Scene, config: RefractDataConfig, split: str, index: int) 
     seeds = np.random.SeedSequence([config.seed, SPLITS.index(split), index])
     stage, camera, share = _stand(scene, np.random.default_rng(seeds), config.resolution)
     noise = int(seeds.generate_state(1)[0] >> 1)
+    with_reference = split != "generator"
+    spp = config.spp if with_reference else 0
+    return _render(stage, camera, share, config.screen if with_reference else 0, spp, noise)
+
+
+def frame_at(scene: Scene, share: Float[np.ndarray, "p"], resolution: int, screen: int, spp: int = 0) -> Frame:
+    """Render the frame of given parameters; `choose_variant` first.
+
+    Args:
+        share: where each parameter lies in its range, in [0, 1], in the order of the card.
+        screen: side of the screen-space buffers.
+        spp: samples a pixel of the reference; 0 leaves it out.
+
+    Raises:
+        UserError: the camera stands badly.
+    """
+    drawn = at_shares(scene, share)
+    stage, camera = Stage(drawn), camera_of(drawn, resolution)
+    problem = stage.problem(camera)
+    if problem is not None:
+        raise UserError(f"The camera {problem}.", "a camera inside the room, in free space", "move it, or the body")
+    return _render(stage, camera, share, screen, spp, 0)
+
+
+def _render(stage: Stage, camera: Camera, share: np.ndarray, screen: int, spp: int, noise: int) -> Frame:
+    """All buffers, with a reference where spp is above 0."""
     opaque = stage.gbuffer(camera)
-    size = (camera.height, camera.width)
-    has_reference = split != "generator"
-    colour, depth = _screen(stage, camera, config.screen if has_reference else 0)
-    reference = (
-        srgb(stage.reference(camera, whole_samples(config.spp), noise)) if has_reference else np.zeros((*size, 3))
-    )
+    colour, depth = _screen(stage, camera, screen)
+    black = np.zeros((camera.height, camera.width, 3))
+    reference = srgb(stage.reference(camera, whole_samples(spp), noise)) if spp else black
     return Frame(
         reference=reference.astype(np.float32),
-        has_reference=has_reference,
+        has_reference=spp > 0,
         **opaque,
         direct=srgb(stage.direct(camera)).astype(np.float32),
         **stage.alone(camera),

@@ -124,10 +124,15 @@ def ranges(scene: Scene) -> dict[str, Range]:
 
 def draw(scene: Scene, rng: np.random.Generator) -> tuple[Scene, Float[np.ndarray, "p"]]:
     """The scene with a number for every range, and those numbers scaled to [0, 1] over their ranges."""
+    share = rng.random(len(ranges(scene)))
+    return at_shares(scene, share), share
+
+
+def at_shares(scene: Scene, share: Float[np.ndarray, "p"]) -> Scene:
+    """The scene with a number for every range, at that share of it."""
     drawn = ranges(scene)
-    share = rng.random(len(drawn))
     numbers = {n: r.low + s * (r.high - r.low) for (n, r), s in zip(drawn.items(), share, strict=True)}
-    return with_values(scene, numbers), share
+    return with_values(scene, numbers)
 
 
 def with_ranges(scene: Scene, settings: Sequence[str]) -> Scene:
