@@ -1,19 +1,24 @@
 """Measures, evaluation and comparison of refraction models on a room of glass balls, and the page with sliders."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
 from refraction_toy import make_toy_frames, toy_frame
 from starlette.testclient import TestClient
 
-from catacaustics.config import RefractEvaluateConfig, RefractReportConfig, RefractTrainConfig
+from catacaustics.config import RefractDataConfig, RefractEvaluateConfig, RefractReportConfig, RefractTrainConfig
 from catacaustics.errors import UserError
 from catacaustics.files import read_json
 from catacaustics.refraction import measures, report
+from catacaustics.refraction.data import frame_at, make_frame
 from catacaustics.refraction.evaluate import evaluate, measure_speed, render_frame
 from catacaustics.refraction.frames import open_frames
 from catacaustics.refraction.models import load_model
+from catacaustics.refraction.scenes import find_scene, with_ranges
 from catacaustics.refraction.train import train
+from catacaustics.refraction.variants import VECTORISED, choose_variant
 from catacaustics.web.refraction import RefractionView, refraction_app
 
 
@@ -166,6 +171,21 @@ def test_the_page_gets_its_sliders_and_pictures_of_the_model(client):
     assert image.shape == (32, 32, 3)
     web.post("/api/render", json={"values": [0, 0, 0], "shown": "path traced"})
     assert asked[-1][1] > 0
+
+
+def test_a_frame_of_given_parameters_is_the_frame_of_the_data_set_that_drew_them():
+    config = RefractDataConfig("checker", Path("unused"), resolution=12, screen=24)
+    choose_variant("auto", VECTORISED)
+    scene = find_scene("checker")
+    drawn = make_frame(scene, config, "generator", 3)
+    made = frame_at(scene, drawn.parameters.astype(float), 12, 24)
+    assert made.screen.shape == (24, 24, 3)
+    assert not made.has_reference
+    np.testing.assert_allclose(made.depth, drawn.depth, atol=1e-5)
+    moved = np.linalg.norm(made.landing - drawn.landing, axis=-1)
+    assert (moved < 1e-3).mean() > 0.95  # the card's float32 tips a path at an edge
+    with pytest.raises(UserError, match="camera"):
+        frame_at(with_ranges(scene, ["eye.distance=0.7:3"]), np.ones(len(drawn.parameters)), 12, 24)
 
 
 @pytest.mark.parametrize(
