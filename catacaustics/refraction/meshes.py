@@ -220,7 +220,7 @@ def body(distance: Distance, low: Vector, high: Vector, cells: int = 64) -> Mesh
         square = np.maximum((gradient**2).sum(-1), 1e-12)
         vertices = vertices - np.clip(distance(vertices) / square, -step, step)[:, None] * gradient
     normals = normalize(_gradient(distance, vertices, 0.1 * step))
-    return _outward(Mesh(vertices, normals, np.zeros((len(vertices), 2)), _net_faces(value < 0, index)))
+    return Mesh(vertices, normals, np.zeros((len(vertices), 2)), _net_faces(value < 0, index))
 
 
 def _window(values: np.ndarray, corner: np.ndarray) -> np.ndarray:
@@ -241,6 +241,8 @@ def _net_faces(inside: np.ndarray, index: np.ndarray) -> np.ndarray:
         edges = np.argwhere(swapped[:-1, 1:-1, 1:-1] != swapped[1:, 1:-1, 1:-1])
         i, j, k = edges.T
         quad = np.stack([cells[i, j, k], cells[i, j + 1, k], cells[i, j + 1, k + 1], cells[i, j, k + 1]], -1)
+        leaves = swapped[:-1, 1:-1, 1:-1][i, j, k] != (axis == 1)  # x, z, the axes left of y, are left-handed about it
+        quad = np.where(leaves[:, None], quad, quad[:, ::-1])
         faces += [quad[:, [0, 1, 2]], quad[:, [0, 2, 3]]]
     return np.concatenate(faces)
 

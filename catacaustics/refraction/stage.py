@@ -100,9 +100,25 @@ def _paint(body_texture: Any) -> Any:
     return mi.load_dict({"type": "diffuse", "reflectance": {"type": "bitmap", "bitmap": bitmap, "wrap_mode": "repeat"}})
 
 
-@lru_cache(maxsize=64)
+_last: dict[str, tuple[Any, Any]] = {}
+"""The last shape of each body by name, and what it was made of."""
+
+
 def _shape(body: Body, pose: Pose, around: float) -> Any:
-    """The Mitsuba shape of a drawn body. What does not move is made once."""
+    """The Mitsuba shape of a drawn body. What does not move is made once.
+
+    Kernels hold the numbers that Mitsuba gives to shapes. The last shape is let go first, so that the next one takes
+    its number and no kernel has to be compiled again.
+    """
+    made_of = (body, pose, around)
+    if body.name in _last and _last[body.name][0] == made_of:
+        return _last[body.name][1]
+    _last.pop(body.name, None)
+    _last[body.name] = (made_of, _made(body, pose, around))
+    return _last[body.name][1]
+
+
+def _made(body: Body, pose: Pose, around: float) -> Any:
     import mitsuba as mi
 
     if body.ior is None:
