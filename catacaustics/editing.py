@@ -255,15 +255,16 @@ def _upright(up: Float[np.ndarray, "3"] | None, turn: float) -> Float[np.ndarray
 
 def _mirrored(scene: Scene, index: int) -> torch.Tensor:
     """World positions of what a reflector mirrors: with a moved one they moved along."""
-    warp, points = scene.warps[index], scene.reflections[index].positions
-    moves = []
-    while warp is not inner_warp(warp):
+
+    def moved(warp: nn.Module, points: torch.Tensor) -> torch.Tensor:
+        if isinstance(warp, DecoupledWarp):
+            return moved(warp.warp, points)
         if isinstance(warp, MovedWarp):
-            moves.append(warp)
-        warp = warp.warp
-    for move in reversed(moves):
-        points = move.scale * points @ move.rotation.T + move.shift
-    return points
+            return warp.scale * moved(warp.warp, points) @ warp.rotation.T + warp.shift
+        return points
+
+    cloud: PointParameters = scene.reflections[index]  # pyright: ignore[reportAssignmentType]
+    return moved(scene.warps[index], cloud.positions)
 
 
 def edit(config: EditConfig) -> None:

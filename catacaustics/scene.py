@@ -274,6 +274,7 @@ class Scene(nn.Module):
         round; where the warp does not shape their images, disks face the camera."""
         viewport = viewport or camera.viewport
         cloud, warp = self.reflections[index], self.warps[index]
+        assert isinstance(cloud, PointParameters)
         center, warp_center = self._center(camera), self._center(warp_camera or camera)
         decoupled = warp_camera is not None and not torch.equal(center, warp_center)
         if motion is not None:

@@ -60,14 +60,13 @@ def blending_weights(
     disks = disks or _all_disks(scene, camera)
     through = 1.0
     for i in scene.reflector_order(camera):
-        rows, positions, normals, footprints, opacities, _ = disks[i]
-        near = points_in_view(positions, footprints, camera, viewport, scene.splatting)
-        parts = [t[near] for t in (positions, normals, footprints, opacities)]
+        near = points_in_view(disks[i].positions, disks[i].footprints, camera, viewport, scene.splatting)
+        rows, positions, normals, footprints, opacities, _ = (t[near] for t in disks[i])
         shown = torch.ones(len(near), 1, device=scene.device, requires_grad=i == index)
-        output = splat_points(*parts, shown, camera, viewport, scene.splatting)
+        output = splat_points(positions, normals, footprints, opacities, shown, camera, viewport, scene.splatting)
         if i == index:
             (weights,) = torch.autograd.grad(output.image.sum(), shown)
-            return rows[near], through * weights[:, 0]
+            return rows, through * weights[:, 0]
         through *= float(output.transmittance)
     raise ValueError(f"the scene has no reflector {index}")
 
@@ -249,7 +248,8 @@ def true_pixels(
             axes = np.array(geometry["rotation"], float) @ np.diag(geometry["radii"])
         axes = run_from_truth.scale * run_from_truth.rotation @ axes
         middle = run_from_truth.apply(np.array(geometry["center"], float)[None])[0]
-        found = specular_points(*(torch.from_numpy(np.ascontiguousarray(a)) for a in (points, center, middle, axes)))
+        tensors = [torch.from_numpy(np.ascontiguousarray(a)) for a in (points, center, middle, axes)]
+        found = specular_points(tensors[0], tensors[1], tensors[2], tensors[3])
         positions, visible = found.points.numpy(), found.visible.numpy()
     else:
         raise UserError(
@@ -292,13 +292,13 @@ def draw_dots(
     """The image with a coloured dot on each visible point; a point has the same colour in every picture."""
     import cv2
 
-    radius = radius or max(image.shape[1] / 110, 2.0)
+    size = radius or max(image.shape[1] / 110, 2.0)
     picture = np.ascontiguousarray(to_bytes(image))
     colors = 255 * colorize((np.arange(len(pixels)) + 0.5) / max(len(pixels), 1), "hsv")
     for pixel, color in zip(pixels[visible], colors[visible], strict=True):
         place = tuple(np.round((pixel - 0.5) * 16).astype(int).tolist())
-        for size, shade in ((radius + 1, (0.0, 0.0, 0.0)), (radius, tuple(color.tolist()))):
-            cv2.circle(picture, place, round(size * 16), shade, -1, cv2.LINE_AA, 4)
+        for extent, shade in ((size + 1, (0.0, 0.0, 0.0)), (size, tuple(color.tolist()))):
+            cv2.circle(picture, place, round(extent * 16), shade, -1, cv2.LINE_AA, 4)
     return picture
 
 

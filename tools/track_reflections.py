@@ -54,8 +54,8 @@ def with_trails(image: np.ndarray, tracks: Tracks) -> np.ndarray:
     for j, color in enumerate(colors):
         for k in range(len(tracks.pixels) - 1):
             if tracks.visible[k : k + 2, j].all():
-                ends = (np.round(16 * (tracks.pixels[k : k + 2, j] - 0.5)).astype(int)).tolist()
-                cv2.line(picture, *(tuple(end) for end in ends), color.tolist(), 1, cv2.LINE_AA, 4)
+                start, end = np.round(16 * (tracks.pixels[k : k + 2, j] - 0.5)).astype(int).tolist()
+                cv2.line(picture, tuple(start), tuple(end), tuple(color.tolist()), 1, cv2.LINE_AA, 4)
     return draw_dots(np.float32(picture) / 255, tracks.pixels[-1], tracks.visible[-1])
 
 

@@ -71,6 +71,10 @@ class PlaneWarp(nn.Module):
         scale: length in which the plane's offset is learned.
     """
 
+    start_point: Tensor
+    start_normal: Tensor
+    scale: Tensor
+
     def __init__(self, point: Float[Tensor, "3"], normal: Float[Tensor, "3"], scale: float):
         super().__init__()
         self.register_buffer("start_point", point)
@@ -103,6 +107,10 @@ class QuadricWarp(nn.Module):
         sphere: the three radii stay equal.
         concave: the inner side mirrors.
     """
+
+    start_center: Tensor
+    start_axes: Tensor
+    concave: Tensor
 
     def __init__(self, center: Float[Tensor, "3"], axes: Float[Tensor, "3 3"], sphere: bool, concave: bool = False):
         super().__init__()
@@ -141,6 +149,9 @@ class NeuralWarp(nn.Module):
         layers, width: hidden layers and their width (paper: 4 x 256).
     """
 
+    middle: Tensor
+    half_size: Tensor
+
     def __init__(self, low: Float[Tensor, "3"], high: Float[Tensor, "3"], layers: int = 4, width: int = 256):
         super().__init__()
         self.register_buffer("middle", (low + high) / 2)
@@ -177,6 +188,10 @@ class MovedWarp(nn.Module):
     Physically right where the surroundings move too; `moved_mirror` is the mirror moved in resting surroundings.
     """
 
+    scale: Tensor
+    rotation: Tensor
+    shift: Tensor
+
     def __init__(self, warp: nn.Module, scale: float, rotation: Float[Tensor, "3 3"], shift: Float[Tensor, "3"]):
         super().__init__()
         self.warp = warp
@@ -207,6 +222,11 @@ class DecoupledWarp(nn.Module):
         pivot: (3,) where both are at the same place.
         strength: 0 leaves reflections as they are.
     """
+
+    offset: Tensor
+    gain: Tensor
+    pivot: Tensor
+    strength: Tensor
 
     def __init__(
         self, warp: nn.Module, offset: Float[Tensor, "3"], gain: float, pivot: Float[Tensor, "3"], strength: float = 1.0
