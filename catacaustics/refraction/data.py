@@ -227,8 +227,8 @@ def _pending(config: RefractDataConfig, card: dict[str, Any]) -> list[_Job]:
 
 
 def _prepare(variant: str) -> None:
-    """Start Mitsuba in a process of its own; the main process alone answers to an interrupt."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """Start Mitsuba in a process of its own. An interrupt ends its shard: Mitsuba has stopped a picture half-way."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     _single_thread(variant)
 
 

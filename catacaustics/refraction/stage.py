@@ -251,10 +251,9 @@ class Stage:
                 },
             }
         )
-        # A seed that is no data would be compiled into the kernel.
-        image = mi.render(
-            scene, sensor=sensor, integrator=mi.load_dict(integrator), spp=spp, seed=dr.opaque(mi.UInt32, seed)
-        )
+        made = mi.load_dict(integrator)
+        # A seed that is no data would be compiled into the kernel. mi.render would hide an interrupt.
+        image = made.render(scene, sensor=sensor, seed=dr.opaque(mi.UInt32, seed), spp=spp)
         return np.array(image)
 
     def gbuffer(self, camera: Camera) -> dict[str, np.ndarray]:
