@@ -93,7 +93,8 @@ def test_a_short_training_does_not_try_networks_and_says_so(tmp_path, monkeypatc
     def run(trials, name, question, settings):
         tried.append(name)
         score = 30.0 if name == "sphere" else 20.0
-        return Trial(name, question, settings, 1.0, 80, 100, 10, [[score, score]], [score, score])
+        trials.done.append(Trial(name, question, settings, 1.0, 80, 100, 10, [[score, score]], [score, score]))
+        return trials.done[-1]
 
     monkeypatch.setattr(selection._Trials, "run", run)
     config = TrainConfig(capture.root, tmp_path / "run", minutes=4.0)

@@ -5,9 +5,10 @@ import pytest
 import torch
 from scipy.spatial import ConvexHull
 
-from catacaustics.geometry import hull_mesh
+from catacaustics.cameras import Camera, pixel_centers
+from catacaustics.geometry import hull_mesh, look_at
 from catacaustics.reflectors.fit import fit_ellipsoid, fit_plane, fit_sphere, surroundings
-from catacaustics.reflectors.volume import ReflectionVolume
+from catacaustics.reflectors.volume import ReflectionVolume, volume_from_masks
 from catacaustics.reflectors.warps import (
     MovedWarp,
     NeuralWarp,
@@ -177,6 +178,26 @@ def test_the_plane_of_a_thin_volume_is_its_face_towards_the_cameras():
         point, normal = fit_plane(volume, cameras)
         assert abs(normal[2] * side - 1) < 1e-3
         assert point[2] == pytest.approx(0.0 if side > 0 else -0.02, abs=2e-3)
+
+
+def test_a_flat_mirror_seen_from_the_front_alone_is_found_inside_its_thick_volume():
+    """Masks from the front leave a double pyramid; the mirror is its widest section, 20 degrees oblique here."""
+    turn = look_at(np.zeros(3), np.array([0.3, 0.2, 1.0]), np.array([0.0, 1.0, 0.1]))[:3, :3]
+    across, along, normal = turn
+    corners = np.array([0.6 * i * across + 0.4 * j * along for i, j in ((-1, -1), (1, -1), (1, 1), (-1, 1))])
+    masks, centers = [], []
+    for k, angle in enumerate(np.linspace(-0.7, 0.7, 6)):
+        eye = -3 * (np.cos(angle) * normal + np.sin(angle) * across) + (0.8 if k % 2 else -0.5) * along
+        camera = Camera(300, 200, 330.0, 330.0, 150.0, 100.0, look_at(eye, np.zeros(3), np.array([0.0, -1.0, 0.0])))
+        outline = camera.project(corners)[0]
+        edges = [(outline[i], outline[(i + 1) % 4] - outline[i]) for i in range(4)]
+        offsets = pixel_centers(camera.viewport)[..., None, :] - [a for a, _ in edges]
+        side = np.stack([e[0] * offsets[..., i, 1] - e[1] * offsets[..., i, 0] for i, (_, e) in enumerate(edges)])
+        masks.append((f"view{k}", camera, (side > 0).all(0) | (side < 0).all(0)))
+        centers.append(eye)
+    point, found = fit_plane(volume_from_masks("mirror", masks), np.array(centers))
+    assert np.degrees(np.arccos(-found @ normal)) < 0.5
+    assert abs(point @ normal) < 0.003
 
 
 def test_surroundings_are_spread_evenly_and_show_the_nearest_known_point():

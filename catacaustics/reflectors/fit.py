@@ -10,6 +10,8 @@ from catacaustics.geometry import normalize, sphere_directions
 from catacaustics.reflectors.volume import ReflectionVolume
 from catacaustics.shapes import Float
 
+_FLAT = 0.1
+"""A volume thinner than this share of its length is a plate as it is."""
 _THINNEST = 0.1
 """A fitted radius below this share of the largest one is not believed."""
 
@@ -17,19 +19,59 @@ _THINNEST = 0.1
 def fit_plane(
     volume: ReflectionVolume, cameras: Float[np.ndarray, "m 3"]
 ) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """A point and the unit normal of the face of a thin volume: across its least extent, on the side of most cameras.
+    """A point and the unit normal, towards most cameras, of the plane of a flat reflector.
+
+    A thin volume shows its face. Views from the front alone leave a double pyramid: the mirror is the section that all
+    bounding planes touch, as each was lifted from its outline. Least squares of their distances from the section.
 
     Args:
         cameras: camera centres.
     """
-    rng = np.random.default_rng(0)
-    surface = volume.sample_surface(4000, rng)[0]
+    from scipy.optimize import minimize
+
+    surface = volume.sample_surface(4000, np.random.default_rng(0))[0]
     middle = surface.mean(0)
-    normal = np.linalg.svd(surface - middle, full_matrices=False)[2][2]
-    if np.median((cameras - middle) @ normal) < 0:
-        normal = -normal
-    height = np.quantile((surface - middle) @ normal, 0.95)
-    return middle + height * normal, normal
+    extents, axes = np.linalg.svd(surface - middle, full_matrices=False)[1:]
+    thin = axes[2] if np.median((cameras - middle) @ axes[2]) > 0 else -axes[2]
+    if extents[2] < _FLAT * extents[0]:
+        return middle + np.quantile((surface - middle) @ thin, 0.95) * thin, thin
+
+    def plane(start: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        normal = normalize(start + x[:2] @ np.linalg.svd(start[None])[2][1:])
+        return middle + x[2] * volume.radius * normal, normal
+
+    found = []
+    for start in (thin, normalize(np.median(cameras, 0) - middle)):
+        simplex = np.vstack([np.zeros(3), 0.3 * np.eye(3)])
+        answer = minimize(
+            lambda x, start=start: _gaps(volume, *plane(start, x)),
+            np.zeros(3),
+            method="Nelder-Mead",
+            options={"initial_simplex": simplex, "xatol": 1e-4, "fatol": 1e-9},
+        )
+        found.append((answer.fun, plane(start, answer.x)))
+    point, normal = min(found, key=lambda pair: pair[0])[1]
+    return point, normal if np.median((cameras - point) @ normal) > 0 else -normal
+
+
+def _gaps(volume: ReflectionVolume, point: Float[np.ndarray, "3"], normal: Float[np.ndarray, "3"]) -> float:
+    """Mean squared distance of a volume's bounding planes from its section by a plane, in units of its radius; 1 where
+    the plane misses the volume."""
+    basis = np.linalg.svd(normal[None])[2][1:]
+    lines = np.c_[volume.halfspaces[:, :3] @ basis.T, volume.halfspaces[:, :3] @ point + volume.halfspaces[:, 3]]
+    corners = 4 * volume.radius * np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])
+    for *slope, offset in lines:  # Sutherland and Hodgman 1974
+        height = corners @ slope + offset
+        inside, following = height <= 0, np.roll(height, -1)
+        crossing = inside != (following <= 0)
+        share = height / np.where(crossing, height - following, 1)
+        cuts = corners + share[:, None] * (np.roll(corners, -1, axis=0) - corners)
+        kept = np.stack([inside, crossing], 1).ravel()
+        corners = np.stack([corners, cuts], 1).reshape(-1, 2)[kept]
+        if not len(corners):
+            return 1.0
+    gaps = (lines[:, :2] @ corners.T).max(1) + lines[:, 2]
+    return float(np.mean(gaps**2)) / volume.radius**2
 
 
 def fit_sphere(volume: ReflectionVolume) -> tuple[Float[np.ndarray, "3"], float]:

@@ -32,6 +32,8 @@ _SIZES = (1.0, 0.8, 0.65)
 """Sizes that a quadric is fitted from, in units of the one that touches its volume."""
 _SHAPE_STEPS, _SHAPE_SIZE = 30, 120
 """Steps of each fit, and the longer side of its images."""
+_PLAIN_SHARE = 0.75
+"""Of a flat mirror's sources, points of the stereo cloud as they are; the rest is spread over directions."""
 _SURFACE_SHARE = 0.3
 """Primary points on the reflectors' surfaces are at most this share of the cloud."""
 
@@ -149,10 +151,21 @@ def reflection_seeds(capture: Capture, reflector: Reflector, config: TrainConfig
         colors = np.broadcast_to(color, positions.shape)
     else:
         cloud = capture.points()
+        count = config.reflection_points
+        if model == "plane":
+            # A wide mirror shows what stands before any part of it: most sources are points of the cloud as they are.
+            point, normal = fit_plane(volume, np.array([v.camera.center for v in capture.train]))
+            front = np.flatnonzero((cloud.positions - point) @ normal > 0.02 * volume.radius)
+            whole = cloud.select(rng.permutation(front)[: int(_PLAIN_SHARE * count)])
+            count -= len(whole)
         far = 2 * max(float(np.linalg.norm(v.camera.center - volume.center)) for v in capture.train)
         positions, colors = surroundings(
-            cloud.positions.astype(np.float64), cloud.colors, volume, config.reflection_points, far, color, rng
+            cloud.positions.astype(np.float64), cloud.colors, volume, count, far, color, rng
         )
+        if model == "plane":
+            positions, colors = np.r_[whole.positions, positions], np.r_[whole.colors, colors]
+            order = rng.permutation(len(positions))
+            positions, colors = positions[order], colors[order]
         normals = np.zeros_like(positions)
     columns = (positions, normals, colors, np.zeros(len(positions)))
     return Seeds(*(np.ascontiguousarray(c, np.float32) for c in columns))
@@ -260,7 +273,8 @@ def seen_through(
 
 
 def start_shapes(scene: Scene, capture: Capture, config: TrainConfig) -> None:
-    """Fit every quadric to the photographs while everything else stands still, from several sizes; the best remains.
+    """Fit every quadric and plane to the photographs while everything else stands still, quadrics from several sizes;
+    the best remains.
 
     A volume from few or careless masks is too large, and a convex hull has handles and spouts in it; training does not
     find back from far. The surroundings are known in outline, so that a mirror of the right shape shows about the right
@@ -270,18 +284,18 @@ def start_shapes(scene: Scene, capture: Capture, config: TrainConfig) -> None:
     cameras = cameras[:: max(1, len(cameras) // 10)]
     with frozen(scene):
         for warp, volume in zip(scene.warps, scene.volumes, strict=True):
-            quadric = warp.quadric if isinstance(warp, QuadricNeuralWarp) else warp
-            if isinstance(quadric, QuadricWarp):
+            mirror = warp.quadric if isinstance(warp, QuadricNeuralWarp) else warp
+            if isinstance(mirror, QuadricWarp | PlaneWarp):
                 boxes = [_middle_box(volume.scaled(0.6), camera) for _, camera in cameras]
                 seen = [(v, c, box) for (v, c), box in zip(cameras, boxes, strict=True) if box is not None]
                 if seen:
-                    _start_shape(scene, capture, quadric, seen)
+                    _start_shape(scene, capture, mirror, seen)
 
 
 def _start_shape(
-    scene: Scene, capture: Capture, quadric: QuadricWarp, cameras: list[tuple[View, Camera, Viewport]]
+    scene: Scene, capture: Capture, mirror: QuadricWarp | PlaneWarp, cameras: list[tuple[View, Camera, Viewport]]
 ) -> None:
-    parameters = list(quadric.parameters())
+    parameters = list(mirror.parameters())
     targets = []
     for view, camera, box in cameras:
         photo = photograph(capture, view, camera)
@@ -293,11 +307,12 @@ def _start_shape(
         return (image - targets[i]).abs().mean() + dssim(image, targets[i])
 
     found = []
-    for size in _SIZES:
+    for size in _SIZES if isinstance(mirror, QuadricWarp) else (1.0,):
         with torch.no_grad():
             for parameter in parameters:
                 parameter.zero_()
-            quadric.log_radii.fill_(float(np.log(size)))
+            if isinstance(mirror, QuadricWarp):
+                mirror.log_radii.fill_(float(np.log(size)))
         for parameter in parameters:
             parameter.requires_grad_(True)
         optimizer = torch.optim.Adam(parameters, 0.02)
