@@ -42,6 +42,16 @@ def trained(data, tmp_path_factory):
     return run, training.train(RefractTrainConfig(data, run, "hybrid", **SMALL))
 
 
+def test_texture_coordinates_are_learned_from_true_landing_points_and_follow_the_predicted_ones(smooth_frame):
+    buffers = frame_buffers(smooth_frame[0])
+    moved = buffers._replace(landing=buffers.landing + 0.3)
+    generator = fresh_model("hybrid").generator
+    with torch.no_grad():
+        uv = [m.split_output("hybrid", generator.train(mode)(b)).uv for mode in (True, False) for b in (buffers, moved)]
+    assert not torch.equal(uv[0], uv[1])
+    assert torch.equal(uv[2], uv[3])
+
+
 def fresh_model(name, textures=5, size="small"):
     torch.manual_seed(1)
     model = m.RefractionModel(name, size, m.Layout("toy", ()), toy_textures()[:textures], "cpu")

@@ -284,8 +284,8 @@ class RefractionModel(nn.Module):
 
 
 def new_generator(kind: Kind, size: str, textures: int) -> Generator:
-    world = kind in ("world", "hybrid")
-    return Generator(output_channels(kind, textures), SIZES[size], world).to(memory_format=torch.channels_last)
+    world, places = kind in ("world", "hybrid"), 3 * textures if kind == "hybrid" else 0
+    return Generator(output_channels(kind, textures), SIZES[size], world, places).to(memory_format=torch.channels_last)
 
 
 def new_renderer(kind: Kind | None, size: str) -> Renderer:

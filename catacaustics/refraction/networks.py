@@ -157,19 +157,31 @@ class Generator(nn.Module):
     World coordinates, channels 3 to 5 with `world`, are found as first surface + distance * direction: how a ray is
     bent is a smooth function that knows nothing of the scene behind, unlike the point where it lands. The direction is
     a mixture of the ray and the guesses of `exit_guesses`, plus what the network adds.
+
+    Args:
+        outputs: channels.
+        world: whether there are world coordinates.
+        places: of the outputs, the last ones that depend on the world coordinates: a small network of its own learns
+            from the true ones which texture coordinates and object belong to a point, and is given the predicted ones.
+            It takes the other network's code as it is: learning textures must not cost accuracy of directions.
     """
 
-    def __init__(self, outputs: int, size: Size, world: bool):
+    def __init__(self, outputs: int, size: Size, world: bool, places: int):
         super().__init__()
-        self.octaves, self.outputs, self.world = size.octaves, outputs, world
+        self.octaves, self.direct, self.world = size.octaves, outputs - places, world
         self.objects = ObjectEncoder(size)
         self.trunk = UNet(size.width + 3 * (1 + 2 * size.octaves) + 3 + 1 + 4 * 3, size)
         self.head = nn.Sequential(_conv(2 * size.width + 4 * 3, 2 * size.width, 1), nn.ReLU())
-        self.last = nn.Conv2d(2 * size.width, outputs + 5 * world, 1)
+        self.last = nn.Conv2d(2 * size.width, self.direct + 5 * world, 1)
         self.last.weight.data *= 0.1
         nn.init.zeros_(self.last.bias)
         if world:
             self.last.bias.data[-5:-3] = torch.tensor([0.5, 1.0])  # at the start the ray goes straight on
+        self.place: nn.Sequential | None = None
+        if places:
+            inside = 3 * size.width
+            first, second = _conv(2 * size.width + 3 * (1 + 2 * 4), inside, 1), _conv(inside, inside, 1)
+            self.place = nn.Sequential(first, nn.ReLU(), second, nn.ReLU(), nn.Conv2d(inside, places, 1))
 
     def forward(self, buffers: Buffers) -> Float[Tensor, "b outputs h w"]:
         objects = self.objects(buffers)
@@ -178,13 +190,19 @@ class Generator(nn.Module):
         ways = [buffers.rays, *guesses]
         geometry = [encode(buffers.position, self.octaves), buffers.normal, buffers.depth]
         x = self.trunk(_join(objects, *geometry, *ways))
-        x = _precise(self.last, self.head(_join(x, objects, *ways)))
+        code = self.head(_join(x, objects, *ways))
+        x = _precise(self.last, code)
         if not self.world:
             return x
-        x, distance, shares = x[:, : self.outputs], softplus(x[:, -5:-4]), x[:, -4:]
+        x, distance, shares = x[:, : self.direct], softplus(x[:, -5:-4]), x[:, -4:]
         bent = sum(share * way for share, way in zip(shares.split(1, 1), ways, strict=True))
         landing = nearest[:, 1:4] + distance * normalize(bent + x[:, 3:6], dim=1)
-        return torch.cat([x[:, :3], landing, x[:, 6:]], 1)
+        x = torch.cat([x[:, :3], landing], 1)
+        if self.place is None:
+            return x
+        if self.training:
+            landing = torch.where(buffers.landing_object[:, None] >= 0, buffers.landing, landing.detach())
+        return torch.cat([x, _precise(self.place, _join(code.detach(), encode(landing, 4)))], 1)
 
 
 class Renderer(nn.Module):

@@ -145,7 +145,7 @@ def _take_generator(model: RefractionModel, path: Path) -> None:
         )
     assert model.generator is not None
     fill(model.generator, weights, path)
-    model.generator.requires_grad_(False)
+    model.generator.requires_grad_(False).eval()
 
 
 # What a step learns ----------------------------------------------------------------------------------------------
