@@ -14,6 +14,7 @@ from catacaustics.images import read_image
 TOOLS = Path(__file__).parents[1] / "tools"
 sys.path.insert(0, str(TOOLS))
 
+import check_hands_on  # noqa: E402
 import clone_reflector  # noqa: E402
 import edit_reflections  # noqa: E402
 import export_scene  # noqa: E402
@@ -78,6 +79,17 @@ def test_an_exported_scene_looks_like_the_scene_without_reflections(runs, tmp_pa
     told = capsys.readouterr().out
     assert float(told.split("reflections: ")[1].split(" dB")[0]) > 30
     assert read_image(tmp_path / "out" / "gaussians.jpg").shape == (72, 192, 3)
+
+
+def test_the_check_of_all_edits_finds_them_right(runs, tmp_path):
+    """Clone and decoupled edits as on a trained scene; the toy has no truth for tracks."""
+    settings = {"move": (0.5, -2.5, 0.5), "views": 1, "width": 96, "json": tmp_path / "hands_on.json"}
+    check_hands_on.main(check_hands_on.Check(runs["sphere"], **settings))
+    numbers = json.loads((tmp_path / "hands_on.json").read_text())
+    assert numbers["decoupled_by_nothing"] == 0
+    assert numbers["clone_not_moved"] < 1e-5
+    assert min(numbers["clone_moved_psnr"]) > 40
+    assert numbers["stereo"][0]["monotone"]
 
 
 def test_the_scripts_are_short():

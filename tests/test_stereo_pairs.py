@@ -84,7 +84,7 @@ def test_comfort_lowers_the_disparity_of_reflections_step_by_step_to_that_of_the
 
 def test_the_image_in_a_flat_mirror_has_the_disparity_of_its_depth(capture, camera):
     """Points on a wall behind the camera, mirrored in a plane in front of it: all are seen at one depth."""
-    scene = copy.deepcopy(scene_of(capture, "plane"))
+    scene = copy.deepcopy(scene_of(capture, "sphere"))
     forward, rng = camera.camera_from_world[2, :3], np.random.default_rng(0)
     across = camera.camera_from_world[:2, :3]
     mirror = BALL_CENTER
