@@ -194,6 +194,7 @@ def _region(values: dict[str, float] | None) -> str:
 def chart(rows: list[dict[str, Any]]) -> str:
     """T.L1 against milliseconds a frame as SVG: a line a model, a point a size, bars of one deviation over seeds."""
     from matplotlib.figure import Figure
+    from matplotlib.ticker import FuncFormatter
 
     figure = Figure(figsize=(9, 5), layout="constrained")
     axes = figure.add_subplot()
@@ -206,6 +207,8 @@ def chart(rows: list[dict[str, Any]]) -> str:
             text = f"{model} {row['size']}" if i == len(own) - 1 else row["size"]
             axes.annotate(text, (x[i], y[i]), (8, 5), textcoords="offset points", fontsize=8, color=color)
     axes.set_xscale("log")
+    for ticks in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
+        ticks(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.set_xlabel("milliseconds a frame")
     axes.set_ylabel("T.L1 on glass (lower is better)")
     axes.margins(x=0.2, y=0.12)
@@ -289,7 +292,9 @@ def _articles(config: RefractReportConfig, result: dict[str, Any]) -> list[str]:
         images += [enlarged(name, view.image) for name, view in views.items()]
         lookups = [enlarged("True colour at the landing points", true_color)]
         lookups += [
-            enlarged(f"{name}: looked up", np.zeros_like(view.image) if view.looked_up is None else view.looked_up)
+            enlarged(f"{name} looks nothing up", np.zeros_like(view.image))
+            if view.looked_up is None
+            else enlarged(f"{name}: looked up", view.looked_up)
             for name, view in views.items()
         ]
         errors = [enlarged("Direct light, no glass", frame.direct)]
