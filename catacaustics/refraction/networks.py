@@ -125,7 +125,7 @@ class ObjectEncoder(nn.Module):
         super().__init__()
         self.octaves = size.octaves
         inputs = OBJECT_CHANNELS + 3 * 2 * size.octaves + 3 + 3 * 3 + 3 * 5 + 3
-        self.first, self.second = _conv(inputs, size.width, 1), _conv(size.width, size.width, 1)
+        self.first, self.second = _conv(inputs, 3 * size.width, 1), _conv(3 * size.width, size.width, 1)
 
     def forward(self, buffers: Buffers) -> Float[Tensor, "b c h w"]:
         b, k = buffers.objects.shape[:2]
@@ -171,16 +171,18 @@ class Generator(nn.Module):
         self.octaves, self.direct, self.world = size.octaves, outputs - places, world
         self.objects = ObjectEncoder(size)
         self.trunk = UNet(size.width + 3 * (1 + 2 * size.octaves) + 3 + 1 + 4 * 3, size)
-        self.head = nn.Sequential(_conv(2 * size.width + 4 * 3, 2 * size.width, 1), nn.ReLU())
-        self.last = nn.Conv2d(2 * size.width, self.direct + 5 * world, 1)
+        # How rays bend is a function of the pixel's own surface: most of the capacity is here, which costs little.
+        inside = 3 * size.width
+        first, second = _conv(2 * size.width + 4 * 3, inside, 1), _conv(inside, inside, 1)
+        self.head = nn.Sequential(first, nn.ReLU(), second, nn.ReLU())
+        self.last = nn.Conv2d(inside, self.direct + 5 * world, 1)
         self.last.weight.data *= 0.1
         nn.init.zeros_(self.last.bias)
         if world:
             self.last.bias.data[-5:-3] = torch.tensor([0.5, 1.0])  # at the start the ray goes straight on
         self.place: nn.Sequential | None = None
         if places:
-            inside = 3 * size.width
-            first, second = _conv(2 * size.width + 3 * (1 + 2 * 4), inside, 1), _conv(inside, inside, 1)
+            first, second = _conv(inside + 3 * (1 + 2 * 4), inside, 1), _conv(inside, inside, 1)
             self.place = nn.Sequential(first, nn.ReLU(), second, nn.ReLU(), nn.Conv2d(inside, places, 1))
 
     def forward(self, buffers: Buffers) -> Float[Tensor, "b outputs h w"]:
