@@ -474,7 +474,7 @@ class RefractTrainConfig:
     """Folder to write: generator and renderer, checkpoints, metrics.jsonl."""
     model: RefractModel = "hybrid"
     """glassnet has no R-buffer, crystalnet looks colours up by texture coordinates, ssnrb on the screen by world
-    coordinates, direct by screen coordinates (ablation), hybrid by world or texture coordinates, as each pixel needs."""
+    coordinates, direct by screen coordinates (ablation), hybrid by world or texture coordinates, pixel by pixel."""
     part: Literal["both", "generator", "renderer"] = "both"
     """Train only one; the renderer needs a trained generator in the run or in --generator."""
     generator: Path | None = None
