@@ -164,6 +164,8 @@ class Stage:
         outer = [iors.get(b.inside, 1.0) for b in scene.bodies]
         self.media = Media(np.array([iors.get(b.name, np.nan) for b in scene.bodies]), np.array(outer))
         named = {b.name: b for b in scene.bodies}
+        for name in _last.keys() - named.keys():  # of another scene
+            del _last[name]
         self._shapes = [_shape(b, _pose(b, named), around) for b, around in zip(scene.bodies, outer, strict=True)]
         for body, shape in zip(scene.bodies, self._shapes, strict=True):
             box = shape.bbox()
