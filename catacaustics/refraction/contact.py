@@ -33,7 +33,7 @@ def true_colour(frame: Frame, textures: list[np.ndarray]) -> Float[np.ndarray, "
 
 
 def _row(frame: Frame, textures: list[np.ndarray]) -> list[np.ndarray]:
-    valid = (frame.landing_object >= 0)[..., None]
+    valid = np.expand_dims(frame.landing_object >= 0, -1)
     uv = np.concatenate([frame.landing_uv, np.full((*frame.landing_uv.shape[:2], 1), 0.5, np.float32)], -1)
     count = np.repeat(frame.events[..., None] / 8.0, 3, -1)
     count[frame.internal_reflection] *= [1.0, 0.3, 0.3]
@@ -48,7 +48,7 @@ def _row(frame: Frame, textures: list[np.ndarray]) -> list[np.ndarray]:
         frame.albedo,
         frame.direct,
         (frame.normal + 1) / 2,
-        (normal + 1) / 2 * frame.object_mask.any(0)[..., None],
+        (normal + 1) / 2 * np.any(frame.object_mask, 0)[..., None],
     ]
 
 

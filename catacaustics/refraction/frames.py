@@ -15,7 +15,7 @@ import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -121,20 +121,27 @@ def _encode(name: str, value: Any) -> np.ndarray:
 
 
 def _decode(name: str, stored: np.ndarray) -> Any:
-    import cv2
-
     kind = _STORED[name]
     if kind == "fixed":
         return stored.astype(np.float32) / 32767
     if kind == "byte":
         return stored.astype(np.float32) / 255
     if kind == "png":
-        return np.ascontiguousarray(cv2.imdecode(stored, cv2.IMREAD_COLOR)[..., ::-1]) if stored.size else _NO_SCREEN
+        return np.ascontiguousarray(_picture(stored)[..., ::-1]) if stored.size else _NO_SCREEN
     if kind == "inverse":
         return _decode_depth(stored)
     if name == "has_reference":
         return bool(stored)
     return stored.astype(np.float32) if stored.dtype == np.float16 else stored
+
+
+def _picture(png: np.ndarray) -> np.ndarray:
+    import cv2
+
+    picture = cv2.imdecode(png, cv2.IMREAD_UNCHANGED)
+    if picture is None:
+        raise ValueError("a picture in it cannot be decoded")
+    return picture
 
 
 _NO_SCREEN = np.zeros((0, 0, 3), np.uint8)
@@ -154,12 +161,10 @@ def _encode_depth(depth: np.ndarray) -> np.ndarray:
 
 
 def _decode_depth(stored: np.ndarray) -> np.ndarray:
-    import cv2
-
     if not stored.size:
         return np.zeros((0, 0), np.float32)
     nearest = np.frombuffer(stored[:4].tobytes(), np.float32)[0]
-    steps = cv2.imdecode(stored[4:], cv2.IMREAD_UNCHANGED)
+    steps = _picture(stored[4:])
     return nearest * 65535 / np.maximum(steps, 1).astype(np.float32)
 
 
@@ -212,7 +217,8 @@ def read_frame(path: Path, index: int) -> Frame:
         ) from error
 
 
-class _Place(NamedTuple):
+@dataclass(frozen=True)
+class _Place:
     """Where a frame is kept."""
 
     path: Path

@@ -25,6 +25,12 @@ Value = float | Range
 Point = tuple[Value, Value, Value]
 
 
+def number(value: Value | None) -> float:
+    """A value of a drawn scene."""
+    assert isinstance(value, float | int), "draw the scene first"
+    return float(value)
+
+
 @dataclass(frozen=True)
 class Body:
     """A thing: textured, shining or transparent.

@@ -13,7 +13,7 @@ import numpy as np
 from catacaustics.cameras import Camera, pixel_centers
 from catacaustics.errors import UserError
 from catacaustics.geometry import look_at, normalize, rigid, rigid_inverse, sphere_directions
-from catacaustics.refraction.scenes import Body, Scene
+from catacaustics.refraction.scenes import Body, Scene, number
 from catacaustics.refraction.trace import Hits, Media
 from catacaustics.shapes import Float, Int, UInt8
 
@@ -30,12 +30,12 @@ NEAR, FAR = 0.01, 10.0
 
 def camera_of(scene: Scene, resolution: int) -> Camera:
     """The camera of a drawn scene."""
-    azimuth, elevation = np.radians(float(scene.eye.azimuth)), np.radians(float(scene.eye.elevation))  # pyright: ignore[reportArgumentType]
+    azimuth, elevation = np.radians(number(scene.eye.azimuth)), np.radians(number(scene.eye.elevation))
     level = np.cos(elevation)
     away = np.array([np.sin(azimuth) * level, -np.cos(azimuth) * level, np.sin(elevation)])
-    target = np.array(scene.eye.target, float)
-    pose = look_at(target + float(scene.eye.distance) * away, target, np.array([0.0, 0.0, 1.0]))  # pyright: ignore[reportArgumentType]
-    focal = resolution / 2 / np.tan(np.radians(float(scene.eye.fov)) / 2)  # pyright: ignore[reportArgumentType]
+    target = np.array([number(c) for c in scene.eye.target])
+    pose = look_at(target + number(scene.eye.distance) * away, target, np.array([0.0, 0.0, 1.0]))
+    focal = resolution / 2 / np.tan(np.radians(number(scene.eye.fov)) / 2)
     return Camera(resolution, resolution, focal, focal, resolution / 2, resolution / 2, pose)
 
 
@@ -74,12 +74,12 @@ class Pose(NamedTuple):
 
 def _pose(body: Body, bodies: Mapping[str, Body]) -> Pose:
     """Where a drawn body stands in the world."""
-    turn, tilt = np.radians(body.turn), np.radians(body.tilt)  # pyright: ignore[reportArgumentType, reportCallIssue]
+    turn, tilt = np.radians(number(body.turn)), np.radians(number(body.tilt))
     c, s = np.cos(tilt), np.sin(tilt)
     about_x = np.array([[1, 0, 0], [0, c, -s], [0, s, c]])
     c, s = np.cos(turn), np.sin(turn)
     rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]) @ about_x
-    center, size = np.array(body.center, float), float(body.size)  # pyright: ignore[reportArgumentType]
+    center, size = np.array([number(c) for c in body.center]), number(body.size)
     if body.inside:
         outer = _pose(bodies[body.inside], bodies)
         turned = np.array(outer.rotation)
@@ -124,16 +124,16 @@ def _made(body: Body, pose: Pose, around: float) -> Any:
     if body.ior is None:
         bsdf = mi.load_dict({"type": "twosided", "bsdf": _paint(body.texture)})
     else:
-        bsdf = mi.load_dict({"type": "dielectric", "int_ior": float(body.ior), "ext_ior": around})  # pyright: ignore[reportArgumentType]
+        bsdf = mi.load_dict({"type": "dielectric", "int_ior": number(body.ior), "ext_ior": around})
     if body.mesh is None:
         turned = rigid(pose.size * np.array(pose.rotation), np.array(pose.center))
         return mi.load_dict({"type": "sphere", "to_world": mi.ScalarTransform4f(turned), "bsdf": bsdf})
     mesh = body.mesh().moved(np.array(pose.rotation), np.array(pose.center), pose.size)
     properties = mi.Properties()
     properties["bsdf"] = bsdf
-    if float(body.radiance) > 0:  # pyright: ignore[reportArgumentType]
+    if number(body.radiance) > 0:
         properties["emitter"] = mi.load_dict(
-            {"type": "area", "radiance": {"type": "rgb", "value": float(body.radiance)}}  # pyright: ignore[reportArgumentType]
+            {"type": "area", "radiance": {"type": "rgb", "value": number(body.radiance)}}
         )
     made = mi.Mesh(
         body.name, len(mesh.vertices), len(mesh.faces), props=properties, has_vertex_normals=True,
@@ -160,7 +160,7 @@ class Stage:
 
     def __init__(self, scene: Scene):
         self.scene = scene
-        iors = {b.name: float(b.ior) for b in scene.transparent}  # pyright: ignore[reportArgumentType]
+        iors = {b.name: number(b.ior) for b in scene.transparent}
         outer = [iors.get(b.inside, 1.0) for b in scene.bodies]
         self.media = Media(np.array([iors.get(b.name, np.nan) for b in scene.bodies]), np.array(outer))
         named = {b.name: b for b in scene.bodies}
@@ -193,14 +193,16 @@ class Stage:
         hit = (scene or self.full).ray_intersect(mi.Ray3f(mi.Point3f(*columns[:3]), mi.Vector3f(*columns[3:])))
         shape = dr.reinterpret_array(mi.UInt32, hit.shape)
         dr.eval(hit.t, hit.n, hit.sh_frame.n, hit.uv, shape)
-        vectors = [np.stack([np.array(c) for c in v], -1).astype(float) for v in (hit.n, hit.sh_frame.n, hit.uv)]
-        return Hits(np.array(hit.t).astype(float), *vectors, self._bodies(np.array(shape)))
+        normal, shading, uv = (
+            np.stack([np.array(c) for c in v], -1).astype(float) for v in (hit.n, hit.sh_frame.n, hit.uv)
+        )
+        return Hits(np.array(hit.t).astype(float), normal, shading, uv, self._bodies(np.array(shape)))
 
     def _bodies(self, registered: np.ndarray) -> Int[np.ndarray, "n"]:
         """Indices of bodies from Mitsuba's numbers of shapes."""
         body = np.full(registered.shape, -1)
-        for k, number in enumerate(self._registered):
-            body[registered == number] = k
+        for k, its_number in enumerate(self._registered):
+            body[registered == its_number] = k
         return body
 
     def problem(self, camera: Camera) -> str | None:
@@ -269,7 +271,8 @@ class Stage:
 
         index = dr.arange(mi.UInt32, camera.width * camera.height)
         pose = rigid_inverse(camera.camera_from_world)
-        right, down, forward, center = (mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in v)) for v in pose[:3].T)
+        axes: list[Any] = [mi.Vector3f(*(dr.opaque(mi.Float, float(x)) for x in v)) for v in pose[:3].T]
+        right, down, forward, center = axes
         x = (mi.Float(index % camera.width) + 0.5 - camera.cx) / dr.opaque(mi.Float, camera.fx)
         y = (mi.Float(index // camera.width) + 0.5 - camera.cy) / dr.opaque(mi.Float, camera.fy)
         ray = mi.Ray3f(mi.Point3f(center), dr.normalize(x * right + y * down + forward))
@@ -327,7 +330,8 @@ def _number(shape: Any) -> int:
     import drjit as dr
     import mitsuba as mi
 
-    return int(dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))[0])
+    found: Any = dr.reinterpret_array(mi.UInt32, mi.ShapePtr(shape))
+    return int(found[0])
 
 
 def _load(shapes: list[Any]) -> Any:

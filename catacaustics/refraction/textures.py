@@ -54,7 +54,7 @@ def tiles(columns: int, rows: int, texels: int, seed: int, palette: Sequence[Seq
     for i in range(rows):
         for j in range(columns):
             ground, figure = (np.array(palette[k], float) for k in rng.choice(len(palette), 2, replace=False))
-            shape = np.rot90(motifs[rng.integers(len(motifs))], rng.integers(4))
+            shape = np.rot90(motifs[rng.integers(len(motifs))], int(rng.integers(4)))
             tile = np.where(shape[..., None], figure, ground)
             tile = np.where(grout[..., None], (206, 200, 188), tile)
             tile = cv2.resize(tile, (texels, texels), interpolation=cv2.INTER_AREA)
