@@ -75,13 +75,26 @@ def _gaps(volume: ReflectionVolume, point: Float[np.ndarray, "3"], normal: Float
 
 
 def fit_sphere(volume: ReflectionVolume) -> tuple[Float[np.ndarray, "3"], float]:
-    """Centre s and radius r of the sphere that the bounding planes touch: n . s + d + r = 0, least squares."""
+    """Centre and radius of the sphere that the bounding planes touch."""
+    center, radius = _touching_sphere(volume, volume.halfspaces)
+    return center, float(np.clip(radius, 0.1 * volume.radius, volume.radius))
+
+
+def fit_bowl(volume: ReflectionVolume, cameras: Float[np.ndarray, "m 3"]) -> tuple[Float[np.ndarray, "3"], float]:
+    """Centre and radius of the sphere of a bowl's inner side: of the planes that face away from the cameras, which
+    touch its thin wall; the others touch its rim."""
     planes = volume.halfspaces
+    away = planes[:, :3] @ (np.median(cameras, 0) - volume.center) < 0
+    center, radius = _touching_sphere(volume, planes[away] if away.sum() >= 4 else planes)
+    return center, float(np.clip(radius, 0.5 * volume.radius, 3 * volume.radius))
+
+
+def _touching_sphere(volume: ReflectionVolume, planes: Float[np.ndarray, "k 4"]) -> tuple[np.ndarray, float]:
+    """Centre s and radius r of the sphere that planes touch: n . s + d + r = 0, least squares."""
     matrix = np.c_[planes[:, :3], np.ones(len(planes))]
     # About the volume's centre, so that a direction without planes leaves the centre there.
     answer = np.linalg.lstsq(matrix, -(planes[:, 3] + planes[:, :3] @ volume.center), rcond=1e-6)[0]
-    smallest, largest = 0.1 * volume.radius, volume.radius
-    return volume.center + answer[:3], float(np.clip(answer[3], smallest, largest))
+    return volume.center + answer[:3], float(answer[3])
 
 
 def fit_ellipsoid(volume: ReflectionVolume) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:

@@ -12,7 +12,7 @@ from catacaustics.config import SplatConfig, TrainConfig
 from catacaustics.environment import EnvironmentMap
 from catacaustics.errors import UserError
 from catacaustics.losses import dssim
-from catacaustics.reflectors.fit import fit_ellipsoid, fit_plane, fit_sphere, surroundings
+from catacaustics.reflectors.fit import fit_bowl, fit_ellipsoid, fit_plane, fit_sphere, surroundings
 from catacaustics.reflectors.volume import ReflectionVolume
 from catacaustics.reflectors.warps import (
     NeuralWarp,
@@ -224,8 +224,11 @@ def make_warp(config: TrainConfig, capture: Capture, reflector: Reflector) -> nn
     if model == "sphere":
         center, radius = fit_sphere(volume)
         return QuadricWarp(*tensors(center, radius * np.eye(3)), sphere=True)
-    if model in ("ellipsoid", "concave"):
-        return QuadricWarp(*tensors(*fit_ellipsoid(volume)), sphere=False, concave=model == "concave")
+    if model == "ellipsoid":
+        return QuadricWarp(*tensors(*fit_ellipsoid(volume)), sphere=False)
+    if model == "concave":
+        center, radius = fit_bowl(volume, centers)
+        return QuadricWarp(*tensors(center, radius * np.eye(3)), sphere=False, concave=True)
     corners = np.concatenate([volume.vertices, centers])
     neural = NeuralWarp(*tensors(corners.min(0), corners.max(0)), config.warp_layers, config.warp_width)
     if model == "neural":
@@ -307,7 +310,8 @@ def _start_shape(
         return (image - targets[i]).abs().mean() + dssim(image, targets[i])
 
     found = []
-    for size in _SIZES if isinstance(mirror, QuadricWarp) else (1.0,):
+    convex = isinstance(mirror, QuadricWarp) and not mirror.concave
+    for size in _SIZES if convex else (1.0,):
         with torch.no_grad():
             for parameter in parameters:
                 parameter.zero_()
