@@ -322,7 +322,7 @@ def test_content_keeps_the_colour_or_the_normal_of_the_r_buffer():
 def test_frames_beyond_the_memory_limit_are_read_again(data):
     frames = open_frames(data).split("train")
     one = sum(v.numel() * v.element_size() for v in frame_buffers(frames[0]))
-    cache = BufferCache(frames, 2.5 * one)
+    cache = BufferCache([frames], 2.5 * one)
     for i in range(4):
         assert torch.equal(cache.get(i).reference, frame_buffers(frames[i]).reference)
     assert list(cache.kept) == [2, 3]

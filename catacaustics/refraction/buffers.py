@@ -8,7 +8,6 @@ import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import pad
-from torch.utils.data import ConcatDataset
 
 from catacaustics.refraction.frames import Frame, Frames
 from catacaustics.refraction.lookup import Screen
@@ -50,7 +49,7 @@ class Buffers(NamedTuple):
     def crop(self, y: int, x: int, side: int) -> "Buffers":
         """A square part of the images."""
         window = (..., slice(y, y + side), slice(x, x + side))
-        return Buffers(*(value[window] for value in self[:-2]), *self[-2:])
+        return Buffers._make([*(value[window] for value in self[:-2]), *self[-2:]])
 
     def to(self, device: torch.device | str) -> "Buffers":
         return Buffers(*(value.to(device) for value in self))
@@ -120,19 +119,30 @@ def stack(parts: Sequence[Buffers]) -> Buffers:
 
 
 class BufferCache:
-    """Buffers of a data set's frames, kept up to a number of bytes; what was not used for longest goes first."""
+    """Buffers of the frames of some splits, kept up to a number of bytes; what was not used for longest goes first.
 
-    def __init__(self, frames: Frames | ConcatDataset, most_bytes: float):
-        self.frames, self.most = frames, most_bytes
+    Frames are numbered through, first those of the first split.
+    """
+
+    def __init__(self, splits: Sequence[Frames], most_bytes: float):
+        self.splits, self.most = splits, most_bytes
         self.kept: OrderedDict[int, Buffers] = OrderedDict()
         self.bytes = 0
+
+    def frame(self, index: int) -> Frame:
+        """Read a frame."""
+        for split in self.splits:
+            if index < len(split):
+                return split[index]
+            index -= len(split)
+        raise IndexError(f"{index} frames too far")
 
     def get(self, index: int) -> Buffers:
         """Buffers of one frame, b = 1."""
         if index in self.kept:
             self.kept.move_to_end(index)
             return self.kept[index]
-        return self.keep(index, frame_buffers(self.frames[index]))
+        return self.keep(index, frame_buffers(self.frame(index)))
 
     def keep(self, index: int, buffers: Buffers) -> Buffers:
         """Keep the buffers of a frame that was read by other means."""

@@ -57,7 +57,7 @@ class LossWeights(NamedTuple):
 
     coordinates: float = 1.0
     tv: float = 1.5e-8
-    index: float = 1.0
+    entropy: float = 1.0
     normal: float = 2.0
 
 
@@ -125,7 +125,7 @@ def generator_losses(
         own = select(prediction.uv, index.clamp_min(0))
         losses["uv"] = weights.coordinates * _masked_l1(own, buffers.landing_uv, lands)
         entropy = cross_entropy(prediction.logits, index.clamp_min(0), reduction="none")[:, None]
-        losses["index"] = weights.index * _masked_mean(entropy, lands)
+        losses["index"] = weights.entropy * _masked_mean(entropy, lands)
         coordinates.append(prediction.uv.flatten(1, 2))
     if weights.tv:
         planes = torch.cat(coordinates, 1)
@@ -258,7 +258,8 @@ class RefractionModel(nn.Module):
         self, name: str, size: str, layout: Layout, textures: Sequence[np.ndarray], device: torch.device | str
     ):
         super().__init__()
-        self.name, self.size, self.layout, self.kind = name, size, layout, kind_of(name)
+        self.name, self.size, self.layout = name, size, layout
+        self.kind: Kind | None = kind_of(name)
         self.textures = Textures(textures, device)
         self.generator = new_generator(self.kind, size, len(textures)).to(device) if self.kind else None
         self.renderer = new_renderer(self.kind, size).to(device)
@@ -285,11 +286,11 @@ class RefractionModel(nn.Module):
 
 def new_generator(kind: Kind, size: str, textures: int) -> Generator:
     world, places = kind in ("world", "hybrid"), 3 * textures if kind == "hybrid" else 0
-    return Generator(output_channels(kind, textures), SIZES[size], world, places).to(memory_format=torch.channels_last)
+    return Generator(output_channels(kind, textures), SIZES[size], world, places).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
 
 def new_renderer(kind: Kind | None, size: str) -> Renderer:
-    return Renderer(R_CHANNELS if kind else 0, SIZES[size]).to(memory_format=torch.channels_last)
+    return Renderer(R_CHANNELS if kind else 0, SIZES[size]).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
 
 def save_part(path: Path, network: nn.Module, header: dict[str, Any], extra: dict[str, Tensor] | None = None) -> None:

@@ -39,7 +39,13 @@ def _join(*parts: Tensor) -> Tensor:
 def _conv(inputs: int, outputs: int, side: int = 3, stride: int = 1) -> nn.Conv2d:
     conv = nn.Conv2d(inputs, outputs, side, stride, side // 2)
     nn.init.kaiming_normal_(conv.weight, nonlinearity="relu")
-    nn.init.zeros_(conv.bias)
+    return _biased(conv, [0.0] * outputs)
+
+
+def _biased(conv: nn.Conv2d, bias: list[float]) -> nn.Conv2d:
+    """The convolution with this bias."""
+    assert conv.bias is not None
+    conv.bias.data = torch.tensor(bias)
     return conv
 
 
@@ -175,11 +181,10 @@ class Generator(nn.Module):
         inside = 3 * size.width
         first, second = _conv(2 * size.width + 4 * 3, inside, 1), _conv(inside, inside, 1)
         self.head = nn.Sequential(first, nn.ReLU(), second, nn.ReLU())
-        self.last = nn.Conv2d(inside, self.direct + 5 * world, 1)
+        # At the start the ray goes straight on.
+        bias = [0.0] * self.direct + [0.5, 1.0, 0.0, 0.0, 0.0] * world
+        self.last = _biased(nn.Conv2d(inside, len(bias), 1), bias)
         self.last.weight.data *= 0.1
-        nn.init.zeros_(self.last.bias)
-        if world:
-            self.last.bias.data[-5:-3] = torch.tensor([0.5, 1.0])  # at the start the ray goes straight on
         self.place: nn.Sequential | None = None
         if places:
             first, second = _conv(inside + 3 * (1 + 2 * 4), inside, 1), _conv(inside, inside, 1)
@@ -222,10 +227,9 @@ class Renderer(nn.Module):
         self.objects = ObjectEncoder(size)
         self.transmission = UNet(2 * size.width + r_channels, size)
         self.join = _conv(2 * size.width + r_channels, size.width)
-        self.last = nn.Conv2d(size.width, 9 if r_channels else 6, 1)
+        bias = [0.0] * 3 + [1.0] * 3 + [0.0] * (3 if r_channels else 0)  # at the start the image is the direct lighting
+        self.last = _biased(nn.Conv2d(size.width, len(bias), 1), bias)
         nn.init.zeros_(self.last.weight)
-        nn.init.zeros_(self.last.bias)
-        self.last.bias.data[3:6] = 1.0  # at the start the image is the direct lighting
 
     def forward(self, buffers: Buffers, r_buffer: Float[Tensor, "b r h w"]) -> Float[Tensor, "b 3 h w"]:
         """RGB, sRGB-encoded, not clamped. The first three channels of the R-buffer are its colour."""

@@ -56,14 +56,18 @@ def report(config: RefractReportConfig) -> dict[str, Any]:
             resume=True,
         )
         runs.append({"model": model, "size": size, "seed": seed} | _finished(settings, config))
-        result = {"settings": _plain(asdict(config)), "runs": runs, "means": _means(runs)}
-        write_json(out / "comparison.json", result)
+        write_json(out / "comparison.json", _result(config, runs))
+    result = _result(config, runs)
     table = markdown(result)
     write_text(out / "table.md", table)
     write_text(out / "report.html", _page(config, result))
     print(table)
     print(f"report: {out / 'report.html'}")
     return result
+
+
+def _result(config: RefractReportConfig, runs: list[dict[str, Any]]) -> dict[str, Any]:
+    return {"settings": _plain(asdict(config)), "runs": runs, "means": _means(runs)}
 
 
 def _plain(settings: dict[str, Any]) -> dict[str, Any]:

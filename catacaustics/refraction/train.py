@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.utils.data import ConcatDataset
 from tqdm import tqdm
 
 from catacaustics.config import RefractTrainConfig
@@ -86,7 +85,7 @@ def train(config: RefractTrainConfig) -> RefractionModel:
     torch.manual_seed(config.seed)
     model = RefractionModel(config.model, config.size, Layout.of(frames), frames.textures, choose_device(config.device))
     train_frames, more = frames.split("train"), frames.split("generator")
-    cache = BufferCache(ConcatDataset([train_frames, more]), config.cache_gb * 2**30)
+    cache = BufferCache([train_frames, more], config.cache_gb * 2**30)
     share = config.generator_share if kind else 0.0
     short = computes_bfloat16(model.device) if config.precision == "auto" else config.precision == "bfloat16"
     if kind and config.part != "renderer" and config.generator is None:
@@ -154,13 +153,13 @@ def _take_generator(model: RefractionModel, path: Path) -> None:
 def _generator_step(
     model: RefractionModel, config: RefractTrainConfig
 ) -> Callable[[Buffers, list[Place]], dict[str, Tensor]]:
-    kind = model.kind
-    assert model.generator is not None
+    kind, generator = model.kind, model.generator
+    assert generator is not None
     assert kind is not None
     weights = LossWeights(config.weight_coordinates, config.weight_tv, config.weight_index, config.weight_normal)
 
     def losses(batch: Buffers, places: list[Place]) -> dict[str, Tensor]:
-        return generator_losses(kind, split_output(kind, model.generator(batch)), batch, weights)
+        return generator_losses(kind, split_output(kind, generator(batch)), batch, weights)
 
     return losses
 
@@ -176,7 +175,7 @@ def _renderer_step(
         if index not in baked:
             screen: Screen | None = None
             if needs_screen(model.kind):
-                frame = cache.frames[index]
+                frame = cache.frame(index)
                 cache.keep(index, frame_buffers(frame))
                 screen = Screen(*(value.to(device) for value in frame_screen(frame)))
             with torch.no_grad(), torch.autocast(device.type, enabled=False):

@@ -128,10 +128,14 @@ def refraction_app(view: RefractionView) -> Starlette:
 
     def render(body: dict[str, Any]) -> dict[str, Any]:
         values, shown = body.get("values"), body.get("shown")
-        numbers = isinstance(values, list) and all(type(v) in (int, float) and math.isfinite(v) for v in values)
-        if not numbers or len(values) != len(view.parameters):
-            raise HTTPException(400, f"values must be {len(view.parameters)} numbers.")
-        if shown not in view.state()["shown"]:
+        wanted = len(view.parameters)
+        if (
+            not isinstance(values, list)
+            or len(values) != wanted
+            or not all(type(v) in (int, float) and math.isfinite(v) for v in values)
+        ):
+            raise HTTPException(400, f"values must be {wanted} numbers.")
+        if not isinstance(shown, str) or shown not in view.state()["shown"]:
             raise HTTPException(400, f"shown must be one of {', '.join(view.state()['shown'])}.")
         return view.render([float(value) for value in values], shown)
 
