@@ -465,7 +465,7 @@ class RefractTrainConfig:
     """Train a refraction model: its R-buffer generator on coordinates, then its renderer with the generator frozen.
 
     The defaults are for minutes on a CPU. The papers: --size paper --crop 0 --lr-generator 7.5e-5 --lr-renderer 1e-4
-    --lr-final-share 1 --weight-normal 2, for hours on a GPU.
+    --lr-final-share 1 --weight-index 1 --weight-normal 2, for hours on a GPU.
     """
 
     data: Path
@@ -504,9 +504,11 @@ class RefractTrainConfig:
     weight_coordinates: float = 1.0
     weight_tv: float = 1.5e-8
     """Total variation of coordinates, summed over an image."""
-    weight_index: float = 1.0
+    weight_index: float = 0.1
+    """Cross entropy of the object landed on (papers: 1)."""
     weight_normal: float = 0.2
-    """Normals at the landing points (papers: 2, which in a short training leaves the coordinates behind)."""
+    """Normals at the landing points (papers: 2). Both leave the coordinates behind in a short training if they weigh as
+    much as in the papers."""
     weight_l1: float = 1.0
     weight_dssim: float = 1.0
     precision: Literal["auto", "float32", "bfloat16"] = "auto"

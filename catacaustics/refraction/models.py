@@ -177,7 +177,7 @@ def landing_color(
     assert prediction.world is not None
     world = prediction.world
     if kind == "hybrid":
-        world = snap(world, nearest_object(buffers)[0][:, 1:4], buffers.world_to_clip, screen.depth, REACH)
+        world = snap(world, nearest_object(buffers)[0][:, 1:4], buffers.world_to_clip, buffers.depth, REACH)
     ndc, depth = project(world, buffers.world_to_clip)
     by_screen = sample_screen(screen.color, ndc)
     if by_uv is None:
