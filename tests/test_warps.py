@@ -7,7 +7,7 @@ from scipy.spatial import ConvexHull
 
 from catacaustics.cameras import Camera, pixel_centers
 from catacaustics.geometry import hull_mesh, look_at
-from catacaustics.reflectors.fit import fit_ellipsoid, fit_plane, fit_sphere, surroundings
+from catacaustics.reflectors.fit import fit_bent_sheet, fit_bowl, fit_ellipsoid, fit_plane, fit_sphere, surroundings
 from catacaustics.reflectors.volume import ReflectionVolume, volume_from_masks
 from catacaustics.reflectors.warps import (
     MovedWarp,
@@ -198,6 +198,35 @@ def test_a_flat_mirror_seen_from_the_front_alone_is_found_inside_its_thick_volum
     point, found = fit_plane(volume_from_masks("mirror", masks), np.array(centers))
     assert np.degrees(np.arccos(-found @ normal)) < 0.5
     assert abs(point @ normal) < 0.003
+
+
+def hull_volume(points):
+    vertices, faces = hull_mesh(points)
+    return ReflectionVolume("hull", np.unique(ConvexHull(points).equations.round(9), axis=0), vertices, faces)
+
+
+def test_the_inner_side_of_a_bowl_is_found_from_its_outside():
+    """A cap of 68 degrees of a sphere of radius 0.27, open to the cameras above."""
+    polar, turn = (a.ravel() for a in np.meshgrid(np.linspace(0, np.radians(68), 20), np.linspace(0, 2 * np.pi, 40)))
+    down = np.stack([np.sin(polar) * np.cos(turn), np.sin(polar) * np.sin(turn), -np.cos(polar)], 1)
+    cameras = np.array([[0.5, 0, 1.0], [-0.4, 0.3, 1.2], [0.1, -0.5, 0.9]])
+    center, radius = fit_bowl(hull_volume(0.27 * down + [1.0, 2.0, 3.0]), cameras + [1.0, 2.0, 3.0])
+    np.testing.assert_allclose(center, [1.0, 2.0, 3.0], atol=0.01)
+    assert radius == pytest.approx(0.27, rel=0.03)
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_bent_sheet_is_found_as_a_cylinder_with_its_convex_side(side):
+    """An arc of 95 degrees and radius 0.34, 0.4 high, bulging to `side` of x."""
+    angle = np.radians(np.linspace(-47.5, 47.5, 30))
+    arc = np.stack([side * 0.34 * np.cos(angle), 0.34 * np.sin(angle)], 1)
+    volume = hull_volume(np.concatenate([np.c_[arc, np.full(30, z)] for z in (-0.2, 0.2)]))
+    cylinders = fit_bent_sheet(volume)
+    center, axes = cylinders[np.argmax([abs(a[2, 0]) for _, a in cylinders])]
+    np.testing.assert_allclose(center, 0, atol=0.02)
+    np.testing.assert_allclose(np.linalg.norm(axes, axis=0)[1:], 0.34, rtol=0.05)
+    assert side * axes[0, 2] > 0.32
+    assert fit_bent_sheet(tangent_planes(np.zeros(3), 0.3 * np.eye(3))) == []
 
 
 def test_surroundings_are_spread_evenly_and_show_the_nearest_known_point():

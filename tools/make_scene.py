@@ -188,7 +188,8 @@ def make_scene(config: MakeScene, detail: float = 1.0) -> None:
     for i, view in tqdm(pending, desc=config.scene, unit="view"):
         truth, reflector = renderer.truth(view.camera)
         for k, r in enumerate(model.reflectors):
-            write_image(config.out / "masks" / r.name / Path(view.name).with_suffix(".png"), reflector == k)
+            if (reflector == k).any():  # a mask says: here it is seen
+                write_image(config.out / "masks" / r.name / Path(view.name).with_suffix(".png"), reflector == k)
         every_train, every_held_out = config.truth_every
         if (i % every_train if i < config.train else (i - config.train) % every_held_out) == 0:
             write_truth(config.out, view.name, truth)

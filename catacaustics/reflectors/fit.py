@@ -119,6 +119,30 @@ def fit_ellipsoid(volume: ReflectionVolume) -> tuple[Float[np.ndarray, "3"], Flo
     return center + radius * np.array(shift), radius * vectors * np.sqrt(values)
 
 
+def fit_bent_sheet(volume: ReflectionVolume) -> list[tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]]:
+    """Cylinders, as long ellipsoids (centre and half-axes in columns), for a sheet that is bent about either of its
+    long directions; none for a volume that is not flat.
+
+    Over a width 2 w and a height s, an arc has the radius (w^2 + s^2) / (2 s). Its hull has more surface near the chord
+    than near the crown, which tells the convex side.
+    """
+    surface = volume.sample_surface(40_000, np.random.default_rng(0))[0]
+    middle = surface.mean(0)
+    axes = np.linalg.svd(surface - middle, full_matrices=False)[2]
+    heights = (volume.vertices - middle) @ axes.T
+    if heights[:, 2].max() < -heights[:, 2].min():
+        axes[2], heights[:, 2] = -axes[2], -heights[:, 2]
+    half = np.ptp(heights, axis=0) / 2
+    if half[2] > 0.5 * half[1]:
+        return []
+    found = []
+    for along, across in ((0, 1), (1, 0)):
+        radius = (half[across] ** 2 + 4 * half[2] ** 2) / (4 * half[2])
+        center = middle + (heights[:, 2].max() - radius) * axes[2]
+        found.append((center, np.stack([8 * half[along] * axes[along], radius * axes[across], radius * axes[2]], 1)))
+    return found
+
+
 def surroundings(
     points: Float[np.ndarray, "n 3"],
     colors: Float[np.ndarray, "n 3"],

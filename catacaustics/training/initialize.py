@@ -12,7 +12,7 @@ from catacaustics.config import SplatConfig, TrainConfig
 from catacaustics.environment import EnvironmentMap
 from catacaustics.errors import UserError
 from catacaustics.losses import dssim
-from catacaustics.reflectors.fit import fit_bowl, fit_ellipsoid, fit_plane, fit_sphere, surroundings
+from catacaustics.reflectors.fit import fit_bent_sheet, fit_bowl, fit_ellipsoid, fit_plane, fit_sphere, surroundings
 from catacaustics.reflectors.volume import ReflectionVolume
 from catacaustics.reflectors.warps import (
     NeuralWarp,
@@ -32,6 +32,8 @@ _SIZES = (1.0, 0.8, 0.65)
 """Sizes that a quadric is fitted from, in units of the one that touches its volume."""
 _SHAPE_STEPS, _SHAPE_SIZE = 30, 120
 """Steps of each fit, and the longer side of its images."""
+_SHAPE_SHARE = 1 / 6
+"""Of the clouds, for the fits: what sparser ones show is a blur that prefers flat mirrors."""
 _PLAIN_SHARE = 0.75
 """Of a flat mirror's sources, points of the stereo cloud as they are; the rest is spread over directions."""
 _SURFACE_SHARE = 0.3
@@ -239,24 +241,32 @@ def make_warp(config: TrainConfig, capture: Capture, reflector: Reflector) -> nn
 def initial_scene(
     capture: Capture, reflectors: list[Reflector], seeds: list[Seeds], share: float, config: TrainConfig
 ) -> Scene:
-    """A scene with the first `share` of every cloud's seeds: seeds[0] primary, then one per reflector."""
+    """A scene with the first `share` of every cloud's seeds: seeds[0] primary, then one per reflector. The environment
+    map and the mirrors' shapes start from clouds of at least `_SHAPE_SHARE`."""
     torch.manual_seed(config.seed)
-    primary = start_cloud(seeds[0], stage_count(seeds[0], share), primary=True)
     environment = None
     if config.environment_width:
         environment = EnvironmentMap(config.environment_width, max(1, round(0.4 * config.environment_width)))
     renderer = NeuralRenderer(config.renderer_width, config.renderer_layers)
     warps = [make_warp(config, capture, r) for r in reflectors]
-    clouds = [
-        start_cloud(s, stage_count(s, share), False, learns_positions(warp))
-        for s, warp in zip(seeds[1:], warps, strict=True)
-    ]
+
+    def clouds(share: float) -> tuple[PointParameters, list[PointParameters]]:
+        counts = [stage_count(s, share) for s in seeds]
+        reflections = [
+            start_cloud(s, count, False, learns_positions(warp))
+            for s, count, warp in zip(seeds[1:], counts[1:], warps, strict=True)
+        ]
+        return start_cloud(seeds[0], counts[0], primary=True), reflections
+
     volumes = [r.volume for r in reflectors]
-    near = 1e-2 * scene_extent(capture)
-    scene = Scene(primary, clouds, warps, volumes, environment, renderer, SplatConfig.fast(near=near))
+    splatting = SplatConfig.fast(near=1e-2 * scene_extent(capture))
+    scene = Scene(*clouds(max(share, _SHAPE_SHARE)), warps, volumes, environment, renderer, splatting)
     if environment is not None:
         environment.start_from(*seen_through(capture, scene, config))
     start_shapes(scene, capture, config)
+    if share < _SHAPE_SHARE:
+        scene.primary, reflections = clouds(share)
+        scene.reflections = nn.ModuleList(reflections)
     return scene
 
 
@@ -279,9 +289,10 @@ def start_shapes(scene: Scene, capture: Capture, config: TrainConfig) -> None:
     """Fit every quadric and plane to the photographs while everything else stands still, quadrics from several sizes;
     the best remains.
 
-    A volume from few or careless masks is too large, and a convex hull has handles and spouts in it; training does not
-    find back from far. The surroundings are known in outline, so that a mirror of the right shape shows about the right
-    picture. Judged in the middle of the volume, which is mirror in any case.
+    A volume from few or careless masks is too large, a convex hull has handles and spouts in it, and a flat one tells
+    little of how it is bent; training does not find back from far. The surroundings are known in outline, so that a
+    mirror of the right shape shows about the right picture. Judged in the middle of the volume, which is mirror in any
+    case.
     """
     cameras = [(v, scaled_camera(v.camera, min(_SHAPE_SIZE, config.image_size), 1.0)) for v in capture.train]
     cameras = cameras[:: max(1, len(cameras) // 10)]
@@ -292,11 +303,15 @@ def start_shapes(scene: Scene, capture: Capture, config: TrainConfig) -> None:
                 boxes = [_middle_box(volume.scaled(0.6), camera) for _, camera in cameras]
                 seen = [(v, c, box) for (v, c), box in zip(cameras, boxes, strict=True) if box is not None]
                 if seen:
-                    _start_shape(scene, capture, mirror, seen)
+                    _start_shape(scene, capture, mirror, _starts(mirror, volume), seen)
 
 
 def _start_shape(
-    scene: Scene, capture: Capture, mirror: QuadricWarp | PlaneWarp, cameras: list[tuple[View, Camera, Viewport]]
+    scene: Scene,
+    capture: Capture,
+    mirror: QuadricWarp | PlaneWarp,
+    starts: list[list[torch.Tensor]],
+    cameras: list[tuple[View, Camera, Viewport]],
 ) -> None:
     parameters = list(mirror.parameters())
     targets = []
@@ -310,13 +325,12 @@ def _start_shape(
         return (image - targets[i]).abs().mean() + dssim(image, targets[i])
 
     found = []
-    convex = isinstance(mirror, QuadricWarp) and not mirror.concave
-    for size in _SIZES if convex else (1.0,):
+    for start in starts:
         with torch.no_grad():
+            for buffer, value in zip(mirror.buffers(), start, strict=True):
+                buffer.copy_(value)
             for parameter in parameters:
                 parameter.zero_()
-            if isinstance(mirror, QuadricWarp):
-                mirror.log_radii.fill_(float(np.log(size)))
         for parameter in parameters:
             parameter.requires_grad_(True)
         optimizer = torch.optim.Adam(parameters, 0.02)
@@ -329,11 +343,24 @@ def _start_shape(
         for parameter in parameters:
             parameter.requires_grad_(False)
         total = float(sum(float(error(i)) for i in range(len(cameras))))
-        found.append((total if np.isfinite(total) else np.inf, [p.detach().clone() for p in parameters]))
+        state = [t.detach().clone() for t in (*mirror.buffers(), *parameters)]
+        found.append((total if np.isfinite(total) else np.inf, state))
     best = min(found, key=lambda pair: pair[0])[1]
     with torch.no_grad():
-        for parameter, value in zip(parameters, best, strict=True):
-            parameter.copy_(value)
+        for tensor, value in zip((*mirror.buffers(), *parameters), best, strict=True):
+            tensor.copy_(value)
+
+
+def _starts(mirror: QuadricWarp | PlaneWarp, volume: ReflectionVolume) -> list[list[torch.Tensor]]:
+    """Buffers of a mirror to start from: as it is; convex ones smaller too, or bent sheets where the volume is flat."""
+    start = [b.clone() for b in mirror.buffers()]
+    if isinstance(mirror, PlaneWarp) or mirror.concave:
+        return [start]
+    sheets = [] if len(mirror.log_radii) == 1 else fit_bent_sheet(volume)
+    center, axes, concave = start
+    if sheets:
+        return [start, *([torch.from_numpy(c).to(center), torch.from_numpy(a).to(axes), concave] for c, a in sheets)]
+    return [[center, size * axes, concave] for size in _SIZES]
 
 
 def _middle_box(core: ReflectionVolume, camera: Camera) -> Viewport | None:
