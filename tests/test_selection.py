@@ -1,6 +1,7 @@
 """Model selection: the rule, and the choice on a capture whose answer is known."""
 
 import json
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from catacaustics.capture.dataset import open_capture
 from catacaustics.config import TrainConfig
 from catacaustics.errors import UserError
 from catacaustics.reflectors.volume import ReflectionVolume, build_volume
-from catacaustics.training import selection
+from catacaustics.training import initialize, selection
 from catacaustics.training.initialize import named_reflectors
 from catacaustics.training.selection import LADDER, LEAST_GAIN, Trial, best, choose_models, gain
 from catacaustics.training.train import train
@@ -44,8 +45,11 @@ def chosen(tmp_path_factory):
     """A ball of one flat colour needs no reflection that moves."""
     root = tmp_path_factory.mktemp("selection")
     capture = make_toy_capture(root / "capture")
-    config = TrainConfig(capture, root / "run", iterations=10, image_size=64, environment_width=20, warp_width=16)
-    train(config)
+    config = TrainConfig(
+        capture, root / "run", iterations=10, image_size=64, environment_width=20, warp_width=16, refine_poses=False
+    )
+    with mock.patch.object(initialize, "_SHAPE_STEPS", 3):
+        train(config)
     return config, json.loads((root / "run" / "model_choice.json").read_text())
 
 

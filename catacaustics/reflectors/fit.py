@@ -63,6 +63,8 @@ def _gaps(volume: ReflectionVolume, point: Float[np.ndarray, "3"], normal: Float
     for *slope, offset in lines:  # Sutherland and Hodgman 1974
         height = corners @ slope + offset
         inside, following = height <= 0, np.roll(height, -1)
+        if inside.all():
+            continue
         crossing = inside != (following <= 0)
         share = height / np.where(crossing, height - following, 1)
         cuts = corners + share[:, None] * (np.roll(corners, -1, axis=0) - corners)
