@@ -15,6 +15,7 @@ from catacaustics.errors import UserError
 from catacaustics.geometry import look_at, normalize, rigid, rigid_inverse, sphere_directions
 from catacaustics.refraction.scenes import Body, Scene, number
 from catacaustics.refraction.trace import Hits, Media
+from catacaustics.refraction.variants import perspective_sensor
 from catacaustics.shapes import Float, Int, UInt8
 
 MAX_DEPTH = 24
@@ -234,27 +235,7 @@ class Stage:
         import drjit as dr
         import mitsuba as mi
 
-        sensor = mi.load_dict(
-            {
-                "type": "perspective",
-                "fov": float(np.degrees(2 * np.arctan(camera.width / (2 * camera.fx)))),
-                "fov_axis": "x",
-                "near_clip": NEAR,
-                "far_clip": FAR,
-                "to_world": mi.ScalarTransform4f(
-                    rigid_inverse(camera.camera_from_world) @ np.diag([-1.0, -1.0, 1.0, 1.0])
-                ),
-                "sampler": {"type": "multijitter"},
-                "film": {
-                    "type": "hdrfilm",
-                    "width": camera.width,
-                    "height": camera.height,
-                    "rfilter": {"type": "box"},
-                    "pixel_format": "rgb",
-                    "component_format": "float32",
-                },
-            }
-        )
+        sensor = perspective_sensor(camera, NEAR, FAR, "multijitter")
         made = mi.load_dict(integrator)
         # A seed that is no data would be compiled into the kernel. mi.render would hide an interrupt.
         image = made.render(scene, sensor=sensor, seed=dr.opaque(mi.UInt32, seed), spp=spp)

@@ -1,11 +1,14 @@
-"""Start Mitsuba with a variant that works on this machine, or say what is missing."""
+"""Mitsuba: start it with a variant that works on this machine, or say what is missing; its sensors."""
 
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
+from catacaustics.cameras import Camera
 from catacaustics.errors import UserError
+from catacaustics.geometry import rigid_inverse
 
 VARIANTS = ("cuda_ad_rgb", "llvm_ad_rgb", "scalar_rgb")
 VECTORISED = VARIANTS[:2]
@@ -48,3 +51,28 @@ def choose_variant(variant: str = "auto", known: Sequence[str] = VARIANTS) -> st
         return name
     remedy = _LLVM_REMEDY + scalar if variant in ("auto", "llvm_ad_rgb") else "use --variant auto"
     raise UserError(f"Mitsuba cannot start {'; '.join(problems)}.", "a working Mitsuba variant", remedy)
+
+
+def perspective_sensor(camera: Camera, near: float, far: float, sampler: str) -> Any:
+    """Mitsuba's sensor of a camera with square pixels and a box filter, for linear RGB images; needs a variant."""
+    import mitsuba as mi
+
+    return mi.load_dict(
+        {
+            "type": "perspective",
+            "fov": float(np.degrees(2 * np.arctan(camera.width / (2 * camera.fx)))),
+            "fov_axis": "x",
+            "near_clip": near,
+            "far_clip": far,
+            "to_world": mi.ScalarTransform4f(rigid_inverse(camera.camera_from_world) @ np.diag([-1.0, -1.0, 1.0, 1.0])),
+            "sampler": {"type": sampler},
+            "film": {
+                "type": "hdrfilm",
+                "width": camera.width,
+                "height": camera.height,
+                "rfilter": {"type": "box"},
+                "pixel_format": "rgb",
+                "component_format": "float32",
+            },
+        }
+    )

@@ -11,8 +11,8 @@ import numpy as np
 
 from catacaustics.cameras import Camera, pixel_centers
 from catacaustics.capture.truth import Truth
-from catacaustics.geometry import rigid_inverse
 from catacaustics.images import resize
+from catacaustics.refraction.variants import perspective_sensor
 from catacaustics.shapes import Bool, Float, Int
 from scene_maker.model import Light, Reflector, SceneModel
 from scene_maker.solids import DENSITY, Mesh, Surface, atlas, merged, sheet
@@ -217,26 +217,7 @@ class Renderer:
         import mitsuba as mi
 
         assert self._lit is not None, "illuminate the scene first"
-        world_from_mitsuba = rigid_inverse(camera.camera_from_world) @ np.diag([-1.0, -1.0, 1.0, 1.0])
-        sensor = mi.load_dict(
-            {
-                "type": "perspective",
-                "fov": float(np.degrees(2 * np.arctan(camera.width / (2 * camera.fx)))),
-                "fov_axis": "x",
-                "near_clip": 0.01,
-                "far_clip": 1000.0,
-                "to_world": mi.ScalarTransform4f(world_from_mitsuba),
-                "sampler": {"type": "independent"},
-                "film": {
-                    "type": "hdrfilm",
-                    "width": camera.width,
-                    "height": camera.height,
-                    "rfilter": {"type": "box"},
-                    "pixel_format": "rgb",
-                    "component_format": "float32",
-                },
-            }
-        )
+        sensor = perspective_sensor(camera, 0.01, 1000.0, "independent")
         integrator = mi.load_dict({"type": "path", "max_depth": MAX_BOUNCES + 1, "rr_depth": MAX_BOUNCES})
         image = mi.render(self._lit, sensor=sensor, integrator=integrator, spp=samples, seed=mi.UInt32(seed))
         return np.array(image) * self.model.exposure
