@@ -2,7 +2,6 @@
 
 import re
 import shutil
-import time
 from dataclasses import asdict, replace
 from html import escape
 from pathlib import Path
@@ -19,9 +18,10 @@ from catacaustics.files import read_json, write_json, write_text
 from catacaustics.metrics import psnr
 from catacaustics.page import figure_svg, html_page
 from catacaustics.reflectors.volume import ReflectionVolume, build_volume
+from catacaustics.run import choose_device, clock_of
 from catacaustics.scene import Scene
 from catacaustics.training.initialize import named_reflectors, usual_points
-from catacaustics.training.loop import device_of, fit
+from catacaustics.training.loop import fit
 from catacaustics.training.photographs import photograph, scaled_camera
 from catacaustics.training.selection import choose_models
 
@@ -70,7 +70,12 @@ def ablate(config: AblateConfig) -> dict[str, Any]:
                 shutil.rmtree(folder, ignore_errors=True)
                 folder.mkdir(parents=True)
                 train = TrainConfig(
-                    config.capture, folder, image_size=config.image_size, seed=seed, device=config.device
+                    config.capture,
+                    folder,
+                    clock=config.clock,
+                    image_size=config.image_size,
+                    seed=seed,
+                    device=config.device,
                 )
                 result = _train_row(capture, volumes, replace(train, **limits, **settings), truth)
                 results.append({"name": name, "budget": budget, "seed": seed} | result)
@@ -106,9 +111,10 @@ def _train_row(
     def probe(scene: Scene, seconds: float, steps: int) -> None:
         curve.append({"seconds": seconds, "steps": steps} | held_out_scores(scene, capture, volumes, config))
 
-    started = time.monotonic()
+    clock = clock_of(config.clock)
+    started = clock()
     chosen = choose_models(capture, volumes, config)
-    selection = time.monotonic() - started
+    selection = clock() - started
     scene = fit(capture, named_reflectors(volumes, chosen.model), chosen, probe)
     for point in curve:  # what the trials took is part of the price
         point["seconds"] += selection if chosen is not config else 0.0
@@ -219,7 +225,7 @@ def _page(capture: Capture, config: AblateConfig, results: list[dict[str, Any]])
     name = escape(f"{Path(config.capture).absolute().name}: ablation")
     facts = (
         f"{len(capture.held_out)} held-out views at up to {config.image_size} pixels, projected reflection volumes; "
-        f"device {device_of(TrainConfig(config.capture, config.out, device=config.device))}. Flicker: mean absolute "
+        f"device {choose_device(config.device)}. Flicker: mean absolute "
         "difference between the changes of renders and photographs from view to view. Flow: mean angle between "
         "displayed and true directions of mirrored things."
     )

@@ -88,6 +88,8 @@ class TrainConfig:
     """Optimiser steps at most."""
     minutes: float | None = None
     """Stop after this much training time; schedules then follow time instead of steps."""
+    clock: Literal["wall", "cpu"] = "wall"
+    """What minutes are measured by; cpu: processor time of this process, fair where others use the machine too."""
     image_size: int = 1000
     """Longer side of the photographs in training; larger ones are reduced."""
     patch: int = 150
@@ -160,6 +162,8 @@ class AblateConfig:
     """Folder to write: ablation.json, ablation.html; finished rows found there are kept."""
     minutes: float | None = 1.0
     """Training time of each row in the comparison at equal time; None leaves it out."""
+    clock: Literal["wall", "cpu"] = "wall"
+    """What minutes are measured by; cpu: processor time of this process, fair where others use the machine too."""
     iterations: int | None = None
     """Steps of each row in the comparison at equal iterations; None leaves it out."""
     rows: tuple[str, ...] = ()

@@ -2,6 +2,8 @@
 
 import json
 import math
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -97,6 +99,11 @@ def choose_device(name: str) -> torch.device:
     if name == "cuda" and automatic == "cpu":
         raise UserError("There is no GPU that PyTorch can use.", "a CUDA device", "leave --device at auto, or take cpu")
     return torch.device(automatic if name == "auto" else name)
+
+
+def clock_of(name: str) -> Callable[[], float]:
+    """Seconds as a configuration's `clock` wants them: "wall", or "cpu": processor time of this process."""
+    return time.monotonic if name == "wall" else time.process_time
 
 
 def read_log(folder: Path) -> tuple[list[dict[str, Any]], int]:

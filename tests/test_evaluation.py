@@ -18,7 +18,7 @@ from catacaustics.evaluation import evaluate, format_table, reflector_mask
 from catacaustics.reflectors.volume import build_volume
 from catacaustics.run import open_run, read_log
 from catacaustics.scene import Scene
-from catacaustics.training.initialize import Reflector, initial_scene, primary_seeds, reflection_seeds
+from catacaustics.training.initialize import Reflector, initial_scene, primary_seeds, reflection_seeds, start_warps
 
 
 @pytest.fixture(scope="module")
@@ -278,8 +278,9 @@ def test_a_scene_from_its_file_is_evaluated_as_it_was_saved(capture, volume, tmp
     config = TrainConfig(capture.root, tmp_path / "run", primary_points=500, reflection_points=50, environment_width=20)
     rng = np.random.default_rng(0)
     reflector = Reflector(volume, "sphere")
-    seeds = [primary_seeds(capture, [reflector], config, rng), reflection_seeds(capture, reflector, config, rng)]
-    scene = initial_scene(capture, [reflector], seeds, 1.0, config)
+    warps = start_warps(capture, [reflector], config)
+    seeds = [primary_seeds(capture, [reflector], config, rng), reflection_seeds(capture, volume, warps[0], config, rng)]
+    scene = initial_scene(capture, [volume], warps, seeds, 1.0, config)
     run = make_run(tmp_path / "run", capture)
     scene.save(run / "scene.safetensors")
     result = evaluate(EvaluateConfig(run, device="cpu"))

@@ -11,7 +11,13 @@ from catacaustics.config import TrainConfig
 from catacaustics.errors import UserError
 from catacaustics.reflectors.volume import build_volume
 from catacaustics.scene import Scene
-from catacaustics.training.initialize import initial_scene, named_reflectors, primary_seeds, reflection_seeds
+from catacaustics.training.initialize import (
+    initial_scene,
+    named_reflectors,
+    primary_seeds,
+    reflection_seeds,
+    start_warps,
+)
 from catacaustics.training.selection import LADDER
 
 
@@ -27,8 +33,9 @@ def build(capture, **options):
     rng = np.random.default_rng(0)
     seeds = [primary_seeds(capture, reflectors, config, rng)]
     reflectors = [r for r in reflectors if r.model != "none"]
-    seeds += [reflection_seeds(capture, r, config, rng) for r in reflectors]
-    return initial_scene(capture, reflectors, seeds, 1.0, config)
+    warps, volumes = start_warps(capture, reflectors, config), [r.volume for r in reflectors]
+    seeds += [reflection_seeds(capture, v, w, config, rng) for v, w in zip(volumes, warps, strict=True)]
+    return initial_scene(capture, volumes, warps, seeds, 1.0, config)
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from catacaustics.errors import UserError
 from catacaustics.reflectors.volume import ReflectionVolume, build_volume
 from catacaustics.training import initialize, selection
 from catacaustics.training.initialize import named_reflectors
-from catacaustics.training.selection import LADDER, LEAST_GAIN, Trial, best, choose_models, gain
+from catacaustics.training.selection import LADDER, LEAST_GAIN, Trial, best, choose_models, finalists, gain
 from catacaustics.training.train import train
 
 
@@ -24,6 +24,15 @@ def test_a_more_complex_candidate_wins_only_by_more_than_the_noise():
     assert best([base, [20.0 + 4, 22.0 - 3, 19.0 + 4, 25.0 - 3]]) == 0  # a mean of 0.5 that four views cannot prove
     assert best([base, [v + 1 for v in base], [v + 1.1 for v in base]]) == 1
     assert best([base, [v - 1 for v in base], [v + 3 for v in base]]) == 2
+
+
+def test_the_finalists_are_the_rules_pick_and_what_is_close_to_it_or_above():
+    base = [20.0, 22.0, 19.0, 25.0]
+    scores = [[v + d for v in base] for d in (0.0, -0.2, 0.1, -2.0, 0.15)]
+    assert best(scores) == 0
+    assert finalists(scores) == [0, 2, 4]  # three at most, the best ones
+    assert finalists(scores[:2] + scores[3:4]) == [0, 1]
+    assert finalists([scores[0], scores[3]]) == [0]
 
 
 def test_views_that_do_not_show_a_reflector_do_not_count():
@@ -55,7 +64,7 @@ def chosen(tmp_path_factory):
 
 def test_every_rung_is_tried_and_the_choice_is_kept_with_its_reasons(chosen):
     config, choice = chosen
-    assert [t["name"] for t in choice["trials"] if t["question"] == "model"] == list(LADDER)
+    assert [t["name"] for t in choice["trials"] if t["question"] == "model" and t["rounds"] == 1] == list(LADDER)
     assert set(choice["taken"]) == {"model", "environment", "reflection points", "primary points", "photographs"} - (
         {"reflection points"} if choice["chosen"]["model"] == ["none"] else set()
     )
@@ -94,10 +103,10 @@ def test_a_short_training_does_not_try_networks_and_says_so(tmp_path, monkeypatc
     capture = open_capture(make_toy_capture(tmp_path / "capture"))
     tried = []
 
-    def run(trials, name, question, settings):
+    def run(trials, name, question, settings, rounds=1):
         tried.append(name)
         score = 30.0 if name == "sphere" else 20.0
-        trials.done.append(Trial(name, question, settings, 1.0, 80, 100, 10, [[score, score]], [score, score]))
+        trials.done.append(Trial(name, question, settings, rounds, 1.0, 80, 100, 10, [[score, score]], [score, score]))
         return trials.done[-1]
 
     monkeypatch.setattr(selection._Trials, "run", run)
@@ -109,3 +118,28 @@ def test_a_short_training_does_not_try_networks_and_says_so(tmp_path, monkeypatc
     assert not {"neural", "quadric+neural"} & set(tried)
     assert "neural and quadric+neural are not tried" in capsys.readouterr().out
     assert "Not tried" in (config.run / "model_choice.html").read_text()
+
+
+def test_a_lead_that_only_a_longer_trial_shows_decides(tmp_path, monkeypatch, capsys):
+    capture = open_capture(make_toy_capture(tmp_path / "capture"))
+    tried = []
+
+    def run(trials, name, question, settings, rounds=1):
+        tried.append((name, rounds))
+        score = {"none": 20.0, "concave": 20.1 + 2 * (rounds - 1)}.get(name, 18.0)
+        trials.done.append(Trial(name, question, settings, rounds, 1.0, 80, 100, 10, [[score, score]], [score, score]))
+        return trials.done[-1]
+
+    monkeypatch.setattr(selection._Trials, "run", run)
+    config = TrainConfig(capture.root, tmp_path / "run", minutes=4.0, environment_width=0)
+    config.run.mkdir()
+    chosen = choose_models(capture, [build_volume(capture, name) for name in capture.reflectors], config)
+    assert chosen.model == ("concave",)
+    assert [t for t in tried if t[1] > 1] == [("none", selection._ROUNDS), ("concave", selection._ROUNDS)]
+
+
+def test_a_finalist_goes_on_from_where_its_trial_ended(chosen):
+    _, choice = chosen
+    longer = [t for t in choice["trials"] if t["rounds"] > 1]
+    assert longer  # on a ball of one flat colour the rungs are close to each other
+    assert all(t["steps"] == selection._ROUNDS * 10 for t in longer)

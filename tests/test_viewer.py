@@ -22,7 +22,7 @@ from catacaustics.images import read_image, read_image_bytes
 from catacaustics.reflectors.volume import build_volume
 from catacaustics.run import open_run
 from catacaustics.scene import Scene
-from catacaustics.training.initialize import Reflector, initial_scene, primary_seeds, reflection_seeds
+from catacaustics.training.initialize import Reflector, initial_scene, primary_seeds, reflection_seeds, start_warps
 from catacaustics.web import live
 from catacaustics.web.viewer import Viewer, _quaternion, serve, window_camera
 
@@ -38,9 +38,10 @@ def capture(tmp_path_factory):
 def scene(capture):
     config = TrainConfig(capture.root, capture.root, primary_points=3000, reflection_points=300, environment_width=20)
     reflector, rng = Reflector(build_volume(capture, "ball"), "sphere"), np.random.default_rng(0)
-    seeds = [primary_seeds(capture, [reflector], config, rng), reflection_seeds(capture, reflector, config, rng)]
-    torch.manual_seed(0)
-    return initial_scene(capture, [reflector], seeds, 1.0, config)
+    warps = start_warps(capture, [reflector], config)
+    seeds = [primary_seeds(capture, [reflector], config, rng)]
+    seeds += [reflection_seeds(capture, reflector.volume, warps[0], config, rng)]
+    return initial_scene(capture, [reflector.volume], warps, seeds, 1.0, config)
 
 
 def test_a_window_that_stands_where_a_photograph_was_taken_has_its_camera(capture):

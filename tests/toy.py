@@ -19,7 +19,7 @@ from catacaustics.reflectors.volume import build_volume
 from catacaustics.scene import Scene
 from catacaustics.splatting import splat_points
 from catacaustics.training import initialize
-from catacaustics.training.initialize import named_reflectors, primary_seeds, reflection_seeds
+from catacaustics.training.initialize import named_reflectors, primary_seeds, reflection_seeds, start_warps
 
 BALL_CENTER = np.array([0.0, -0.35, 0.0])
 BALL_RADIUS = 0.35
@@ -91,9 +91,10 @@ def scene_of(capture: Capture, model: str) -> Scene:
     )
     reflectors = named_reflectors([build_volume(capture, "ball")], config.model)
     rng = np.random.default_rng(0)
-    seeds = [primary_seeds(capture, reflectors, config, rng), reflection_seeds(capture, reflectors[0], config, rng)]
+    volume, warps = reflectors[0].volume, start_warps(capture, reflectors, config)
+    seeds = [primary_seeds(capture, reflectors, config, rng), reflection_seeds(capture, volume, warps[0], config, rng)]
     with mock.patch.object(initialize, "start_shapes"):  # fitting shapes to photographs takes seconds
-        scene = initialize.initial_scene(capture, reflectors, seeds, 1.0, config)
+        scene = initialize.initial_scene(capture, [volume], warps, seeds, 1.0, config)
     with torch.no_grad():
         scene.primary.opacity_logits.fill_(8.0)  # opaque, so that nothing shines through
         scene.reflections[0].features[:, :3] = torch.rand(800, 3, generator=torch.Generator().manual_seed(0))

@@ -13,7 +13,7 @@ mirrored things where the path-traced scene is given. Finished trainings are kep
 import statistics
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -39,6 +39,7 @@ class Bench:
         scenes: folder with the path-traced scenes, under the captures' names, for the true directions.
         minutes: of each training.
         seeds: seeds of the trainings.
+        clock: what minutes are measured by, wall or cpu: processor time, fair where others compute, too.
         image_size: longer side of the photographs.
         json: write the table to this file too.
     """
@@ -48,6 +49,7 @@ class Bench:
     scenes: Path | None = None
     minutes: float = 2.0
     seeds: tuple[int, ...] = (0,)
+    clock: Literal["wall", "cpu"] = "wall"
     image_size: int = 300
     json: Path | None = None
 
@@ -59,7 +61,9 @@ def alone(config: Bench, path: Path) -> dict[str, tuple[float, float]]:
     if len(volumes) < 2:
         return {}
     together = config.out / path.name / "together"
-    base = TrainConfig(path, together, minutes=config.minutes, iterations=10**9, image_size=config.image_size)
+    base = TrainConfig(
+        path, together, minutes=config.minutes, clock=config.clock, iterations=10**9, image_size=config.image_size
+    )
     auto = config.out / path.name / "runs" / f"auto_{config.minutes:g}_min_0".replace(".", "_")
     models = tuple(read_json(auto / "model_choice.json")["chosen"]["model"])
     scores = {}
@@ -87,6 +91,7 @@ def main(config: Bench) -> None:
             minutes=config.minutes,
             rows=ROWS,
             cloud_rungs=(),
+            clock=config.clock,
             seeds=config.seeds,
             image_size=config.image_size,
             truth=truth,

@@ -12,6 +12,8 @@ from catacaustics.shapes import Float
 
 _FLAT = 0.1
 """A volume thinner than this share of its length is a plate as it is."""
+_PLANES = 150
+"""Bounding planes that a mirror's plane is fitted to, at most: a round body of many masks has ten times as many."""
 _THINNEST = 0.1
 """A fitted radius below this share of the largest one is not believed."""
 
@@ -40,11 +42,12 @@ def fit_plane(
         normal = normalize(start + x[:2] @ np.linalg.svd(start[None])[2][1:])
         return middle + x[2] * volume.radius * normal, normal
 
+    planes = volume.halfspaces[:: -(-len(volume.halfspaces) // _PLANES)]
     found = []
     for start in (thin, normalize(np.median(cameras, 0) - middle)):
         simplex = np.vstack([np.zeros(3), 0.3 * np.eye(3)])
         answer = minimize(
-            lambda x, start=start: _gaps(volume, *plane(start, x)),
+            lambda x, start=start: _gaps(planes, volume.radius, *plane(start, x)),
             np.zeros(3),
             method="Nelder-Mead",
             options={"initial_simplex": simplex, "xatol": 1e-4, "fatol": 1e-9},
@@ -54,12 +57,14 @@ def fit_plane(
     return point, normal if np.median((cameras - point) @ normal) > 0 else -normal
 
 
-def _gaps(volume: ReflectionVolume, point: Float[np.ndarray, "3"], normal: Float[np.ndarray, "3"]) -> float:
-    """Mean squared distance of a volume's bounding planes from its section by a plane, in units of its radius; 1 where
-    the plane misses the volume."""
+def _gaps(
+    planes: Float[np.ndarray, "k 4"], radius: float, point: Float[np.ndarray, "3"], normal: Float[np.ndarray, "3"]
+) -> float:
+    """Mean squared distance of the bounding planes of a volume of some radius from its section by a plane, in units of
+    the radius; 1 where the plane misses the volume."""
     basis = np.linalg.svd(normal[None])[2][1:]
-    lines = np.c_[volume.halfspaces[:, :3] @ basis.T, volume.halfspaces[:, :3] @ point + volume.halfspaces[:, 3]]
-    corners = 4 * volume.radius * np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])
+    lines = np.c_[planes[:, :3] @ basis.T, planes[:, :3] @ point + planes[:, 3]]
+    corners = 4 * radius * np.array([[-1.0, -1], [1, -1], [1, 1], [-1, 1]])
     for *slope, offset in lines:  # Sutherland and Hodgman 1974
         height = corners @ slope + offset
         inside, following = height <= 0, np.roll(height, -1)
@@ -73,7 +78,7 @@ def _gaps(volume: ReflectionVolume, point: Float[np.ndarray, "3"], normal: Float
         if not len(corners):
             return 1.0
     gaps = (lines[:, :2] @ corners.T).max(1) + lines[:, 2]
-    return float(np.mean(gaps**2)) / volume.radius**2
+    return float(np.mean(gaps**2)) / radius**2
 
 
 def fit_sphere(volume: ReflectionVolume) -> tuple[Float[np.ndarray, "3"], float]:

@@ -392,9 +392,14 @@ def build_volume(capture: Capture, reflector: str) -> ReflectionVolume:
             f"one of: {', '.join(capture.reflectors) or 'none yet'}",
             f"paint masks: `catacaustics mask {capture.root}`",
         )
+    return volume_from_masks(reflector, volume_masks(capture, reflector))
+
+
+def volume_masks(capture: Capture, reflector: str) -> list[tuple[str, Camera, Bool[np.ndarray, "height width"]]]:
+    """Names, cameras and masks of the `volume_views` of one of a capture's reflectors."""
     masked = {v.name for v in capture.views if capture.mask_path(v, reflector).is_file()}
     masks = [(v.name, v.camera, capture.mask(v, reflector)) for v in volume_views(capture, masked)]
-    return volume_from_masks(reflector, [(name, camera, mask) for name, camera, mask in masks if mask is not None])
+    return [(name, camera, mask) for name, camera, mask in masks if mask is not None]
 
 
 def write_volume(capture: Capture, volume: ReflectionVolume) -> None:

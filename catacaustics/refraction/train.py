@@ -33,7 +33,7 @@ from catacaustics.refraction.models import (
     save_part,
     split_output,
 )
-from catacaustics.run import choose_device
+from catacaustics.run import choose_device, clock_of
 from catacaustics.training.optimizer import optimizer_tensors, restore_optimizer
 
 _LOG_EVERY = 10
@@ -280,7 +280,7 @@ def _progress(state: PartState, part: _Part, config: RefractTrainConfig) -> floa
 def _loop(
     state: PartState, part: _Part, cache: BufferCache, model: RefractionModel, config: RefractTrainConfig
 ) -> None:
-    clock = time.monotonic if config.clock == "wall" else time.process_time
+    clock = clock_of(config.clock)
     device = next(state.network.parameters()).device
     started, saved = clock() - state.seconds, time.monotonic()
     state.network.train()

@@ -40,7 +40,8 @@ def choice_html(folder: Path, result: dict[str, Any], least_gain: float) -> str:
     rule = (
         "Candidates of a question stand in order of complexity. A more complex one is taken only if its mean gain over "
         f"the best so far exceeds both {least_gain:g} dB and twice the standard error of the gain per view. Scores are "
-        "means over training views that the trials did not see; every trial had the same number of steps."
+        "means over training views that the trials did not see; every trial had the same number of steps. Where the "
+        "choice among models was close, the finalists were trained further and the rule was asked again among them."
     )
     if result["untried"]:
         rule += f" Not tried, because the training is too short for a network: {', '.join(result['untried'])}."
@@ -74,8 +75,10 @@ def _table(rows: Sequence[dict[str, Any]], question: str, reflector: int, measur
             f"<td>{trial['seconds']:.1f}</td><td>{trial['steps']}</td><td>{trial['points']:,}</td>"
             f"<td>{trial['parameters']:,}</td>"
         )
-        mark = ' class="taken"' if trial["name"] == taken else ""
-        note = " (taken)" if trial["name"] == taken else ""
+        longest = max(t["rounds"] for t in rows if t["name"] == trial["name"])
+        is_taken = (trial["name"], trial["rounds"]) == (taken, longest)
+        mark = ' class="taken"' if is_taken else ""
+        note = (", finalist" if trial["rounds"] > 1 else "") + (" (taken)" if is_taken else "")
         body.append(f'<tr{mark}><th scope="row">{escape(trial["name"])}{note}</th>{cells}</tr>')
     head = (
         f"<tr><th>candidate</th><th>{measure}</th><th></th><th>seconds</th><th>steps</th><th>points</th>"

@@ -13,7 +13,8 @@ from catacaustics.environment import EnvironmentMap
 from catacaustics.errors import UserError
 from catacaustics.losses import dssim
 from catacaustics.reflectors.fit import fit_bent_sheet, fit_bowl, fit_ellipsoid, fit_plane, fit_sphere, surroundings
-from catacaustics.reflectors.volume import ReflectionVolume
+from catacaustics.reflectors.visual_hull import sample_visual_hull
+from catacaustics.reflectors.volume import ReflectionVolume, volume_masks
 from catacaustics.reflectors.warps import (
     NeuralWarp,
     PlaneWarp,
@@ -135,7 +136,8 @@ def primary_seeds(
     parts = [(cloud.positions, cloud.normals, cloud.colors, np.full(len(cloud), 0.02))]
     for (volume, model), n in zip(reflectors, wanted, strict=True):
         rho = 0.02 if model == "none" else 0.9
-        positions, normals = volume.sample_surface(max(int(n * shrink), 100), rng)
+        masks = volume_masks(capture, volume.name)
+        positions, normals = sample_visual_hull(volume, masks, max(int(n * shrink), 100), rng)
         color = mean_reflector_color(capture, volume)
         parts.append((positions, normals, np.broadcast_to(color, positions.shape), np.full(len(positions), rho)))
     columns = [np.concatenate(c).astype(np.float32) for c in zip(*parts, strict=True)]
@@ -143,20 +145,21 @@ def primary_seeds(
     return Seeds(*(c[order] for c in columns))
 
 
-def reflection_seeds(capture: Capture, reflector: Reflector, config: TrainConfig, rng: np.random.Generator) -> Seeds:
+def reflection_seeds(
+    capture: Capture, volume: ReflectionVolume, warp: nn.Module, config: TrainConfig, rng: np.random.Generator
+) -> Seeds:
     """Where reflection points start: for mirrors, on what the capture knows of the surroundings, evenly spread over
     directions; otherwise at random on the surface of the reflection volume (paper section 4.2)."""
-    volume, model = reflector
     color = mean_reflector_color(capture, volume)
-    if model in ("static", "neural"):
+    if isinstance(warp, StaticWarp | NeuralWarp):
         positions, normals = volume.sample_surface(config.reflection_points, rng)
         colors = np.broadcast_to(color, positions.shape)
     else:
         cloud = capture.points()
         count = config.reflection_points
-        if model == "plane":
+        if isinstance(warp, PlaneWarp):
             # A wide mirror shows what stands before any part of it: most sources are points of the cloud as they are.
-            point, normal = fit_plane(volume, np.array([v.camera.center for v in capture.train]))
+            point, normal = warp.start_point.numpy(), warp.start_normal.numpy()
             front = np.flatnonzero((cloud.positions - point) @ normal > 0.02 * volume.radius)
             whole = cloud.select(rng.permutation(front)[: int(_PLAIN_SHARE * count)])
             count -= len(whole)
@@ -164,7 +167,7 @@ def reflection_seeds(capture: Capture, reflector: Reflector, config: TrainConfig
         positions, colors = surroundings(
             cloud.positions.astype(np.float64), cloud.colors, volume, count, far, color, rng
         )
-        if model == "plane":
+        if isinstance(warp, PlaneWarp):
             positions, colors = np.r_[whole.positions, positions], np.r_[whole.colors, colors]
             order = rng.permutation(len(positions))
             positions, colors = positions[order], colors[order]
@@ -211,14 +214,19 @@ def grow_cloud(cloud: PointParameters, seeds: Seeds, count: int) -> PointParamet
     return grown
 
 
-def make_warp(config: TrainConfig, capture: Capture, reflector: Reflector) -> nn.Module:
-    """The warp of a reflector's model, started from its volume."""
+def start_warps(capture: Capture, reflectors: list[Reflector], config: TrainConfig) -> list[nn.Module]:
+    """The warps of the reflectors' models, started from their volumes; networks from the configuration's seed."""
+    torch.manual_seed(config.seed)
+    centers = np.array([v.camera.center for v in capture.train])
+    return [_start_warp(r, centers, config) for r in reflectors]
+
+
+def _start_warp(reflector: Reflector, centers: Float[np.ndarray, "m 3"], config: TrainConfig) -> nn.Module:
     volume, model = reflector
 
     def tensors(*arrays: np.ndarray) -> list[torch.Tensor]:
         return [torch.from_numpy(np.asarray(a, np.float32)) for a in arrays]
 
-    centers = np.array([v.camera.center for v in capture.train])
     if model == "static":
         return StaticWarp()
     if model == "plane":
@@ -239,16 +247,19 @@ def make_warp(config: TrainConfig, capture: Capture, reflector: Reflector) -> nn
 
 
 def initial_scene(
-    capture: Capture, reflectors: list[Reflector], seeds: list[Seeds], share: float, config: TrainConfig
+    capture: Capture,
+    volumes: list[ReflectionVolume],
+    warps: list[nn.Module],
+    seeds: list[Seeds],
+    share: float,
+    config: TrainConfig,
 ) -> Scene:
     """A scene with the first `share` of every cloud's seeds: seeds[0] primary, then one per reflector. The environment
     map and the mirrors' shapes start from clouds of at least `_SHAPE_SHARE`."""
-    torch.manual_seed(config.seed)
     environment = None
     if config.environment_width:
         environment = EnvironmentMap(config.environment_width, max(1, round(0.4 * config.environment_width)))
     renderer = NeuralRenderer(config.renderer_width, config.renderer_layers)
-    warps = [make_warp(config, capture, r) for r in reflectors]
 
     def clouds(share: float) -> tuple[PointParameters, list[PointParameters]]:
         counts = [stage_count(s, share) for s in seeds]
@@ -258,7 +269,6 @@ def initial_scene(
         ]
         return start_cloud(seeds[0], counts[0], primary=True), reflections
 
-    volumes = [r.volume for r in reflectors]
     splatting = SplatConfig.fast(near=1e-2 * scene_extent(capture))
     scene = Scene(*clouds(max(share, _SHAPE_SHARE)), warps, volumes, environment, renderer, splatting)
     if environment is not None:

@@ -20,6 +20,7 @@ from catacaustics.errors import UserError
 from catacaustics.files import write_json
 from catacaustics.losses import coverage_loss, dssim, total_variation, weight_loss
 from catacaustics.reflectors.volume import ReflectionVolume
+from catacaustics.run import choose_device, clock_of
 from catacaustics.scene import Layers, Scene
 from catacaustics.training.corrections import Corrections
 from catacaustics.training.densification import GradientStatistics, densify
@@ -32,6 +33,7 @@ from catacaustics.training.initialize import (
     reflection_seeds,
     scene_extent,
     stage_count,
+    start_warps,
     usual_points,
 )
 from catacaustics.training.optimizer import RowAdam, make_optimizer, optimizer_tensors, restore_optimizer, set_rates
@@ -100,10 +102,12 @@ def fit(
     config = replace(config, **{k: n for k, n in usual.items() if getattr(config, k) is None})
     seeds = [primary_seeds(capture, reflectors, config, rng)]
     reflectors = [r for r in reflectors if r.model != "none"]
-    seeds += [reflection_seeds(capture, r, config, rng) for r in reflectors]
-    state = _start(capture, reflectors, seeds, config, rng)
+    warps = start_warps(capture, reflectors, config)
+    volumes = [r.volume for r in reflectors]
+    seeds += [reflection_seeds(capture, v, w, config, rng) for v, w in zip(volumes, warps, strict=True)]
+    state = _start(capture, volumes, warps, seeds, config, rng)
     try:
-        _loop(state, capture, [r.volume for r in reflectors], seeds, config, probe, watch)
+        _loop(state, capture, volumes, seeds, config, probe, watch)
     except KeyboardInterrupt:
         save_checkpoint(run, state)
         print(f"training: interrupted at step {state.step}, checkpoint saved; go on with --resume")
@@ -127,29 +131,26 @@ def _keep_freed_memory() -> None:
         library.mallopt(mmap_max, 0)
 
 
-def device_of(config: TrainConfig) -> torch.device:
-    automatic = "cuda" if torch.cuda.is_available() else "cpu"
-    return torch.device(automatic if config.device == "auto" else config.device)
-
-
 def _start(
     capture: Capture,
-    reflectors: list[Reflector],
+    volumes: list[ReflectionVolume],
+    warps: list[torch.nn.Module],
     seeds: list[Seeds],
     config: TrainConfig,
     rng: np.random.Generator,
 ) -> TrainState:
     path = Path(config.run) / "checkpoint.safetensors"
     if not path.exists():
-        started = time.monotonic()  # fitting the mirrors' shapes is training
-        scene = initial_scene(capture, reflectors, seeds, STAGES[0].points, config).to(device_of(config))
+        clock = clock_of(config.clock)
+        started = clock()  # fitting the mirrors' shapes is training
+        scene = initial_scene(capture, volumes, warps, seeds, STAGES[0].points, config).to(choose_device(config.device))
         (Path(config.run) / "metrics.jsonl").unlink(missing_ok=True)
         statistics = GradientStatistics(len(scene.primary), scene.device)
         corrections = _corrections(capture, config)
         optimizer = make_optimizer(scene, config, corrections)
-        seconds = time.monotonic() - started
+        seconds = clock() - started
         return TrainState(scene, corrections, optimizer, rng, statistics, seconds=seconds)
-    scene, tensors, notes = Scene.load_with_extras(path, device_of(config))
+    scene, tensors, notes = Scene.load_with_extras(path, choose_device(config.device))
     corrections = _corrections(capture, config)
     corrections.load_state_dict({k: tensors[f"corrections.{k}"] for k in corrections.state_dict()})
     optimizer = make_optimizer(scene, config, corrections)
@@ -166,7 +167,7 @@ def _start(
 
 def _corrections(capture: Capture, config: TrainConfig) -> Corrections:
     poses, exposure = bool(config.refine_poses), bool(config.exposure)
-    return Corrections(len(capture.train), poses, exposure, scene_extent(capture)).to(device_of(config))
+    return Corrections(len(capture.train), poses, exposure, scene_extent(capture)).to(choose_device(config.device))
 
 
 def save_checkpoint(run: Path, state: TrainState) -> None:
@@ -210,7 +211,8 @@ def _loop(
     run = Path(config.run)
     photographs = PhotographCache(capture)
     extent = scene_extent(capture)
-    started, saved = time.monotonic() - state.seconds, time.monotonic()
+    clock = clock_of(config.clock)
+    started, saved = clock() - state.seconds, time.monotonic()
     probed = sum(_progress(state, config) >= share for share in PROBES)
     layout = "{desc}: {percentage:3.0f}% |{bar}| {elapsed}, {remaining} left{postfix}"
     start = int(1000 * _progress(state, config))
@@ -229,10 +231,10 @@ def _loop(
                 state.densified += 1
             if watch is not None:
                 watch(state.scene)
-            state.seconds = time.monotonic() - started
+            state.seconds = clock() - started
             if probe is not None and _progress(state, config) >= PROBES[min(probed, len(PROBES) - 1)]:
                 probe(state.scene, state.seconds, state.step)
-                started = time.monotonic() - state.seconds
+                started = clock() - state.seconds
                 probed = sum(_progress(state, config) >= share for share in PROBES)
             if state.step % _LOG_EVERY == 0:
                 log.write(json.dumps(_log_row(state, stage, record)) + "\n")

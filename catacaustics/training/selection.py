@@ -3,11 +3,11 @@
 The rule. Rungs are walked from the simplest to the most complex. A more complex one takes the place of the best so far
 only if its mean gain in PSNR inside the reflector exceeds both 0.2 dB and twice the standard error of the gains per
 view: what the noise of a few views could explain is not a reason. The environment map and larger clouds must earn their
-place by the same rule, judged on the whole image and inside the reflectors. All trials get the same steps.
+place by the same rule, judged on the whole image and inside the reflectors. All trials get the same steps; where the
+choice among rungs is close, the finalists go on for `_ROUNDS` times as many, and the rule is asked again among them.
 """
 
 import shutil
-import time
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -19,10 +19,11 @@ from catacaustics.config import TrainConfig
 from catacaustics.files import read_json, write_json, write_text
 from catacaustics.metrics import psnr
 from catacaustics.reflectors.volume import ReflectionVolume
+from catacaustics.run import clock_of
 from catacaustics.scene import Scene
 from catacaustics.training.choice_page import choice_html
 from catacaustics.training.corrections import align_view
-from catacaustics.training.initialize import named_reflectors, scene_extent, usual_points
+from catacaustics.training.initialize import Reflector, named_reflectors, scene_extent, usual_points
 from catacaustics.training.loop import fit
 from catacaustics.training.photographs import photograph, scaled_camera
 
@@ -37,6 +38,10 @@ LEAST_GAIN = 0.2
 
 _STEPS, _HURRIED_STEPS = 250, 80
 """Steps of a trial, and where there are less than `_PATIENT` minutes."""
+_ROUNDS = 3
+"""Finalists are trained this many times as long: a mirror's lead over a static cloud grows while it trains."""
+_CLOSE, _FINALISTS = 0.3, 3
+"""Rungs at most this many dB below the rule's pick go on with it; as many at most, the best ones."""
 _SIZE, _PATCH = 200, 100
 """Longer side of the images, and of the patches, in trials."""
 _FACTORS = (0.5, 1.0, 2.0)
@@ -55,7 +60,9 @@ class Trial:
         name: what was tried.
         question: what it was tried for: model, environment, reflection points or primary points.
         settings: fields of TrainConfig in which it differs.
-        seconds, steps, points, parameters: of the trial; points of all clouds, parameters besides points.
+        rounds: length of the trial in units of the usual steps.
+        seconds: of the trial, or of what was added to the shorter one.
+        steps, points, parameters: of the trial; points of all clouds, parameters besides points.
         inside: PSNR in dB inside each reflector, a list of views each (None where a view does not show it).
         whole: PSNR in dB of the whole image, a list of views.
     """
@@ -63,6 +70,7 @@ class Trial:
     name: str
     question: str
     settings: dict
+    rounds: int
     seconds: float
     steps: int
     points: int
@@ -91,6 +99,14 @@ def best(scores: list[list[float | None]]) -> int:
     return chosen
 
 
+def finalists(scores: list[list[float | None]]) -> list[int]:
+    """Indices of the candidates that a longer trial could put first: the rule's pick and those close to it or above."""
+    pick = best(scores)
+    leads = [gain(s, scores[pick])[0] for s in scores]
+    others = sorted((i for i in range(len(scores)) if i != pick and leads[i] > -_CLOSE), key=lambda i: -leads[i])
+    return sorted([pick, *others[: _FINALISTS - 1]])
+
+
 def choose_models(capture: Capture, volumes: list[ReflectionVolume], config: TrainConfig) -> TrainConfig:
     """The configuration with every `auto` decided; nothing to do where none is. Writes RUN/model_choice.json and
     RUN/model_choice.html; an earlier choice found there is kept, and so are finished trials.
@@ -107,11 +123,7 @@ def choose_models(capture: Capture, volumes: list[ReflectionVolume], config: Tra
     ladder = [rung for rung in LADDER if not (hurried and rung in _NETWORKS)]
     if hurried:
         print(f"model selection: less than {_PATIENT} minutes, so {' and '.join(_NETWORKS)} are not tried")
-    rungs = [trials.run(rung, "model", {"model": _filled(reflectors, rung)}) for rung in ladder]
-    models = [
-        ladder[best([trial.inside[i] for trial in rungs])] if r.model == "auto" else r.model
-        for i, r in enumerate(reflectors)
-    ]
+    models = _models(trials, reflectors, ladder)
     chosen: dict = {"model": tuple(models)}
     taken = {"model": models}
     if config.environment_width:
@@ -133,6 +145,20 @@ def choose_models(capture: Capture, volumes: list[ReflectionVolume], config: Tra
     trials.finish(chosen, taken, [v.name for v in volumes], [rung for rung in LADDER if rung not in ladder])
     minutes = None if config.minutes is None else max(config.minutes - trials.seconds / 60, 0.25 * config.minutes)
     return replace(config, minutes=minutes, **chosen)
+
+
+def _models(trials: "_Trials", reflectors: list[Reflector], ladder: list[str]) -> list[str]:
+    """A rung for each reflector, in two rounds; in a trial all reflectors to be decided have the same one."""
+    first = [trials.run(rung, "model", {"model": _filled(reflectors, rung)}) for rung in ladder]
+    free = [i for i, r in enumerate(reflectors) if r.model == "auto"]
+    close = {i: finalists([trial.inside[i] for trial in first]) for i in free}
+    again = [ladder[k] for k in sorted({k for i in free if len(close[i]) > 1 for k in close[i]})]
+    longer = {rung: trials.run(rung, "model", {"model": _filled(reflectors, rung)}, _ROUNDS) for rung in again}
+    models = [r.model for r in reflectors]
+    for i in free:
+        named = [ladder[k] for k in close[i]]
+        models[i] = named[best([longer[n].inside[i] for n in named]) if len(named) > 1 else 0]
+    return models
 
 
 def _photographs(trials: "_Trials", config: TrainConfig, chosen: dict, taken: dict[str, list[str]]) -> dict:
@@ -194,26 +220,28 @@ class _Trials:
 
     @property
     def seconds(self) -> float:
-        return sum({str(t.settings): t.seconds for t in self.done}.values())
+        return sum({(str(t.settings), t.rounds): t.seconds for t in self.done}.values())
 
-    def run(self, name: str, question: str, settings: dict) -> Trial:
-        """The result of a trial, run now or found."""
+    def run(self, name: str, question: str, settings: dict, rounds: int = 1) -> Trial:
+        """The result of a trial of `rounds` times the usual steps, run now, found, or gone on with."""
         found = [t for t in self.done if t.name == name and t.question == question]
-        if found:
-            return found[0]
+        if found and found[-1].rounds >= rounds:
+            return next(t for t in found if t.rounds == rounds)
         same = [t for t in self.done if dict(t.settings) == _plain(settings) and question != "photographs"]
-        trial = replace(same[0], name=name, question=question) if same else None
-        if trial is None:
+        if same and same[0].question != question:
+            trial = replace(same[0], name=name, question=question)
+        else:
             folder = self.run_folder / "trials" / name.replace(" ", "_")
-            shutil.rmtree(folder, ignore_errors=True)
-            folder.mkdir(parents=True)
-            config = replace(self.config, run=folder, **settings)
-            print(f"model selection: {question}, {name}")
-            started = time.monotonic()
+            if not found:
+                shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir(parents=True, exist_ok=True)
+            config = replace(self.config, run=folder, iterations=rounds * self.config.iterations, **settings)
+            print(f"model selection: {question}, {name}{', finalist' if rounds > 1 else ''}")
+            clock = clock_of(config.clock)
+            started = clock()
             scene = fit(self.capture, named_reflectors(self.volumes, config.model), config)
-            trial = self._scored(scene, name, question, settings, time.monotonic() - started, folder)
-            for heavy in ("checkpoint.safetensors", "scene.safetensors"):
-                (folder / heavy).unlink(missing_ok=True)
+            trial = self._scored(scene, name, question, settings, rounds, folder)
+            trial = replace(trial, seconds=clock() - started)
         self.done.append(trial)
         write_json(self.run_folder / "model_choice.json", {"key": self._key, "trials": [asdict(t) for t in self.done]})
         return trial
@@ -228,6 +256,8 @@ class _Trials:
             "trials": [asdict(t) for t in self.done],
         }
         write_json(self.run_folder / "model_choice.json", result)
+        for heavy in (self.run_folder / "trials").glob("*/*.safetensors"):
+            heavy.unlink()
         write_text(self.run_folder / "model_choice.html", choice_html(self.run_folder, result, LEAST_GAIN))
         words = ", ".join(f"{k} {' '.join(map(str, v)) if isinstance(v, tuple) else v}" for k, v in chosen.items())
         print(f"model selection: {words}; why: {self.run_folder / 'model_choice.html'}")
@@ -239,7 +269,7 @@ class _Trials:
         kept = read_json(path)
         return [Trial(**t) for t in kept["trials"]] if kept.get("key") == self._key else []
 
-    def _scored(self, scene: Scene, name: str, question: str, settings: dict, seconds: float, folder: Path) -> Trial:
+    def _scored(self, scene: Scene, name: str, question: str, settings: dict, rounds: int, folder: Path) -> Trial:
         inside: list[list[float | None]] = [[] for _ in self.volumes]
         whole = []
         for view in self.validation:
@@ -259,7 +289,7 @@ class _Trials:
             p.numel() for n, p in scene.named_parameters() if n.startswith(("warps", "renderer", "environment"))
         )
         steps = len((folder / "metrics.jsonl").read_text().splitlines()) * 10
-        return Trial(name, question, _plain(settings), seconds, steps, points, parameters, inside, whole)
+        return Trial(name, question, _plain(settings), rounds, 0.0, steps, points, parameters, inside, whole)
 
 
 def _plain(settings: dict) -> dict:

@@ -8,9 +8,10 @@ from catacaustics.config import TrainConfig
 from catacaustics.errors import UserError
 from catacaustics.files import write_json
 from catacaustics.reflectors.volume import build_volume
+from catacaustics.run import choose_device
 from catacaustics.scene import Scene
 from catacaustics.training.initialize import named_reflectors
-from catacaustics.training.loop import Watch, device_of, fit
+from catacaustics.training.loop import Watch, fit
 from catacaustics.training.selection import choose_models
 
 
@@ -29,7 +30,7 @@ def train(config: TrainConfig, watch: Watch | None = None) -> Scene:
     finished = run / "scene.safetensors"
     if finished.exists() and config.resume:
         print(f"training: {finished} is finished already, kept")
-        return Scene.load(finished, device_of(config))
+        return Scene.load(finished, choose_device(config.device))
     if not config.resume and (finished.exists() or (run / "checkpoint.safetensors").exists()):
         raise UserError(
             f"{run} already holds a run.", "an empty folder", "add --resume to go on, or choose another folder"

@@ -1,0 +1,98 @@
+"""The surface of the visual hull (Laurentini 1994): what the masks leave of a reflection volume.
+
+The volume is convex so that reflections are free to land anywhere inside. The primary cloud stands for the object
+itself: a neck, a handle or a spout leaves gaps in the convex volume through which the background is seen.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from catacaustics.cameras import Camera
+from catacaustics.geometry import normalize
+from catacaustics.reflectors.volume import ReflectionVolume
+from catacaustics.shapes import Bool, Float
+
+_CELLS = 64
+"""Along the longest side of the volume."""
+_BLUR = 1.5
+"""Standard deviation in pixels of the masks' soft edges, between which the surface is interpolated."""
+_LEVEL = 0.25
+"""Of the soft masks, where the surface is: a pixel outside their outlines, as hands and calibrations err."""
+
+
+def sample_visual_hull(
+    volume: ReflectionVolume,
+    masks: Sequence[tuple[str, Camera, Bool[np.ndarray, "height width"]]],
+    count: int,
+    rng: np.random.Generator,
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Random points of the visual hull's surface and their outward unit normals.
+
+    A point belongs to the hull where it lies in the volume and no mask that it projects into excludes it. The surface
+    is found where the edges of a grid cross it (the corners of marching cubes, Lorensen and Cline 1987). Where the
+    masks leave nothing (they contradict each other, or the object is thinner than a cell), points of the volume.
+
+    Args:
+        masks: names of views, their cameras, and where they see the reflector.
+    """
+    grid, cell = _grid(volume)
+    inside = _soft_inside(volume, grid.reshape(-1, 3), masks).reshape(grid.shape[:3])
+    points, normals = _crossings(grid, inside, cell)
+    if not len(points):
+        return volume.sample_surface(count, rng)
+    # Edges cross a surface evenly up to their slant: |n_x| + |n_y| + |n_z| crossings an area.
+    density = 1 / np.abs(normals).sum(1)
+    chosen = rng.choice(len(points), count, p=density / density.sum())
+    spread = rng.uniform(-0.5, 0.5, (count, 3)) * cell
+    spread -= (spread * normals[chosen]).sum(1, keepdims=True) * normals[chosen]
+    return points[chosen] + spread, normals[chosen]
+
+
+def _grid(volume: ReflectionVolume) -> tuple[Float[np.ndarray, "x y z 3"], float]:
+    low, high = volume.vertices.min(0), volume.vertices.max(0)
+    cell = float((high - low).max()) / _CELLS
+    counts = np.ceil((high - low) / cell).astype(int) + 3
+    first = (low + high) / 2 - cell * (counts - 1) / 2
+    return first + cell * np.stack(np.meshgrid(*map(np.arange, counts), indexing="ij"), -1), cell
+
+
+def _soft_inside(
+    volume: ReflectionVolume,
+    points: Float[np.ndarray, "n 3"],
+    masks: Sequence[tuple[str, Camera, Bool[np.ndarray, "height width"]]],
+) -> Float[np.ndarray, "n"]:
+    """1 inside, 0 outside of all masks together, with soft edges; 0 outside of the volume."""
+    from scipy.ndimage import gaussian_filter, map_coordinates
+
+    inside = np.zeros(len(points))
+    near = np.flatnonzero(volume.scaled(1.05).contains(points))  # soft edges cut before the volume's planes do
+    inside[near] = 1
+    for _, camera, mask in masks:
+        left = near[inside[near] > 0]
+        pixels, depth = camera.project(points[left])
+        soft = gaussian_filter(mask.astype(np.float32), _BLUR)
+        seen = map_coordinates(soft, (pixels - 0.5).T[::-1], order=1, mode="constant", cval=np.nan)
+        unknown = np.isnan(seen) | (depth <= 0)  # beside the picture: nothing is said
+        inside[left] = np.minimum(inside[left], np.where(unknown, 1, seen))
+    return inside
+
+
+def _crossings(
+    grid: Float[np.ndarray, "x y z 3"], inside: Float[np.ndarray, "x y z"], cell: float
+) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+    """Where edges of the grid cross the surface, and the normals there."""
+    from scipy.ndimage import gaussian_filter
+
+    slope = np.stack(np.gradient(gaussian_filter(inside, 1.0), cell), -1)
+    points, slopes = [], []
+    for axis in range(3):
+        a, b = (np.moveaxis(inside, axis, 0)[part] for part in (slice(None, -1), slice(1, None)))
+        crossing = (a < _LEVEL) != (b < _LEVEL)
+        share = ((_LEVEL - a[crossing]) / (b[crossing] - a[crossing]))[:, None]
+        for values, kept in ((grid, points), (slope, slopes)):
+            moved = np.moveaxis(values, axis, 0)
+            kept.append((1 - share) * moved[:-1][crossing] + share * moved[1:][crossing])
+    found, downhill = np.concatenate(points), -np.concatenate(slopes)
+    steep = np.linalg.norm(downhill, axis=1) > 1e-6 / cell
+    return found[steep], normalize(downhill[steep])
