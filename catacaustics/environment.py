@@ -18,10 +18,21 @@ def texels(directions: Float[Tensor, "n 3"], height: int, width: int) -> tuple[I
 
 
 class EnvironmentMap(nn.Module):
-    """Features by direction, zero at the start (paper: 1000 x 400, 6 channels)."""
+    """Features by direction, zero at the start (paper: 1000 x 400, 6 channels).
 
-    def __init__(self, width: int = 1000, height: int = 400):
+    Args:
+        width, height: texels.
+        up: (3,) world direction of a pole, where columns meet: one that photographs hardly show; -y left out.
+    """
+
+    axes: Tensor
+
+    def __init__(self, width: int = 1000, height: int = 400, up: Float[Tensor, "3"] | None = None):
         super().__init__()
+        down = torch.tensor([0.0, 1.0, 0.0]) if up is None else -torch.nn.functional.normalize(up, dim=0)
+        across = torch.eye(3)[2 if abs(float(down[2])) < 0.9 else 0]
+        right = torch.nn.functional.normalize(torch.linalg.cross(down, across), dim=0)
+        self.register_buffer("axes", torch.stack([right, down, torch.linalg.cross(right, down)]))
         self.features = nn.Parameter(torch.zeros(height, width, FEATURES))
 
     def start_from(
@@ -30,7 +41,7 @@ class EnvironmentMap(nn.Module):
         """Set the colours (the first three features) to weighted means of what was seen; texels that saw little take
         them from coarser levels (push-pull, Gortler et al. 1996)."""
         height, width, _ = self.features.shape
-        row, column = texels(directions, height, width)
+        row, column = texels(directions @ self.axes.T, height, width)
         sums = colors.new_zeros(4, height * width)
         sums.index_add_(1, row * width + column, torch.cat([colors * weights[:, None], weights[:, None]], 1).T)
         levels = [sums.view(1, 4, height, width)]
@@ -45,8 +56,8 @@ class EnvironmentMap(nn.Module):
             self.features[..., :3] = filled[0].permute(1, 2, 0)
 
     def forward(self, directions: Float[Tensor, "height width 3"]) -> Float[Tensor, "height width 6"]:
-        """Bilinear lookup for unit world directions; longitude wraps around, the poles are the y axis."""
-        x, y, z = directions.flatten(0, 1).unbind(1)
+        """Bilinear lookup for unit world directions; longitude wraps around."""
+        x, y, z = (directions.flatten(0, 1) @ self.axes.T).unbind(1)
         height, width, channels = self.features.shape
         column = (torch.atan2(x, z) / math.pi + 1) / 2 * width - 0.5
         row = ((torch.asin(y.clamp(-1, 1)) / (math.pi / 2) + 1) / 2 * height - 0.5).clamp(0, height - 1)

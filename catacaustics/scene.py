@@ -26,7 +26,7 @@ from catacaustics.renderer import FEATURES, NeuralRenderer
 from catacaustics.shapes import Float, Int
 from catacaustics.splatting import SplatOutput, points_in_view, splat_points
 
-FORMAT = 2
+FORMAT = 3
 
 WarpCamera = Camera | Sequence[Camera | None] | None
 """The camera that reflections follow instead of the view's own: one for all reflectors, or one for each (None: the

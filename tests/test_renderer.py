@@ -61,6 +61,18 @@ def test_the_environment_map_returns_what_is_stored_in_a_direction():
         torch.testing.assert_close(found, environment.features[row, column], atol=2e-5, rtol=1e-5)
 
 
+def test_the_poles_of_the_environment_map_are_where_up_and_down_are():
+    up = torch.tensor([0.6, 0.0, 0.8])
+    environment = EnvironmentMap(16, 8, up)
+    with torch.no_grad():
+        environment.features.copy_(torch.arange(8.0)[:, None, None].expand(8, 16, 6))
+    level = torch.tensor([0.8, 0.0, -0.6])
+    for direction_, row in ((up, 0.0), (-up, 7.0), (level, 3.5), (torch.tensor([0.0, 1.0, 0.0]), 3.5)):
+        torch.testing.assert_close(environment(direction_[None, None])[0, 0], torch.full((6,), row), atol=1e-4, rtol=0)
+    torch.testing.assert_close(environment.axes @ environment.axes.T, torch.eye(3))
+    torch.testing.assert_close(torch.linalg.det(environment.axes), torch.tensor(1.0))
+
+
 def test_the_environment_map_has_no_seam():
     environment = EnvironmentMap(16, 8)
     with torch.no_grad():

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import nn
 
-from catacaustics.cameras import Camera, Viewport
+from catacaustics.cameras import Camera, Viewport, up_direction
 from catacaustics.capture.dataset import Capture, View
 from catacaustics.config import SplatConfig, TrainConfig
 from catacaustics.environment import EnvironmentMap
@@ -258,7 +258,8 @@ def initial_scene(
     map and the mirrors' shapes start from clouds of at least `_SHAPE_SHARE`."""
     environment = None
     if config.environment_width:
-        environment = EnvironmentMap(config.environment_width, max(1, round(0.4 * config.environment_width)))
+        up = torch.from_numpy(up_direction([v.camera for v in capture.train])).float()
+        environment = EnvironmentMap(config.environment_width, max(1, round(0.4 * config.environment_width)), up)
     renderer = NeuralRenderer(config.renderer_width, config.renderer_layers)
 
     def clouds(share: float) -> tuple[PointParameters, list[PointParameters]]:

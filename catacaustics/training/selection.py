@@ -4,7 +4,7 @@ The rule. Rungs are walked from the simplest to the most complex. A more complex
 only if its mean gain in PSNR inside the reflector exceeds both 0.2 dB and twice the standard error of the gains per
 view: what the noise of a few views could explain is not a reason. The environment map and larger clouds must earn their
 place by the same rule, judged on the whole image and inside the reflectors. All trials get the same steps; where the
-choice among rungs is close, the finalists go on for `_ROUNDS` times as many, and the rule is asked again among them.
+choice among rungs is close, the best of them go on for twice as many, and again, and the rule is asked among them.
 """
 
 import shutil
@@ -38,10 +38,10 @@ LEAST_GAIN = 0.2
 
 _STEPS, _HURRIED_STEPS = 250, 80
 """Steps of a trial, and where there are less than `_PATIENT` minutes."""
-_ROUNDS = 3
-"""Finalists are trained this many times as long: a mirror's lead over a static cloud grows while it trains."""
-_CLOSE, _FINALISTS = 0.3, 3
-"""Rungs at most this many dB below the rule's pick go on with it; as many at most, the best ones."""
+_FINALISTS = (4, 2)
+"""Rungs at most that go on for twice as many steps, then again: a mirror's lead over a static cloud grows with them."""
+_CLOSE = 0.3
+"""dB below the rule's pick at most, for a rung to go on with it."""
 _SIZE, _PATCH = 200, 100
 """Longer side of the images, and of the patches, in trials."""
 _FACTORS = (0.5, 1.0, 2.0)
@@ -99,12 +99,13 @@ def best(scores: list[list[float | None]]) -> int:
     return chosen
 
 
-def finalists(scores: list[list[float | None]]) -> list[int]:
-    """Indices of the candidates that a longer trial could put first: the rule's pick and those close to it or above."""
+def finalists(scores: list[list[float | None]], most: int) -> list[int]:
+    """Indices of the candidates that a longer trial could put first: the rule's pick and those close to it or above,
+    `most` at most."""
     pick = best(scores)
     leads = [gain(s, scores[pick])[0] for s in scores]
     others = sorted((i for i in range(len(scores)) if i != pick and leads[i] > -_CLOSE), key=lambda i: -leads[i])
-    return sorted([pick, *others[: _FINALISTS - 1]])
+    return sorted([pick, *others[: most - 1]])
 
 
 def choose_models(capture: Capture, volumes: list[ReflectionVolume], config: TrainConfig) -> TrainConfig:
@@ -119,14 +120,14 @@ def choose_models(capture: Capture, volumes: list[ReflectionVolume], config: Tra
     if not any(r.model == "auto" for r in reflectors):
         return config
     trials = _Trials(capture, volumes, config)
-    hurried = _hurried(config)  # no networks, usual sizes, photographs as they are
+    hurried = _hurried(config)  # no networks, usual sizes, an environment map, photographs as they are
     ladder = [rung for rung in LADDER if not (hurried and rung in _NETWORKS)]
     if hurried:
         print(f"model selection: less than {_PATIENT} minutes, so {' and '.join(_NETWORKS)} are not tried")
     models = _models(trials, reflectors, ladder)
     chosen: dict = {"model": tuple(models)}
     taken = {"model": models}
-    if config.environment_width:
+    if config.environment_width and not hurried:
         without = trials.run("no environment map", "environment", chosen | {"environment_width": 0})
         base = trials.run("environment map", "environment", chosen)
         if best([without.whole, base.whole]) == 0:
@@ -148,17 +149,21 @@ def choose_models(capture: Capture, volumes: list[ReflectionVolume], config: Tra
 
 
 def _models(trials: "_Trials", reflectors: list[Reflector], ladder: list[str]) -> list[str]:
-    """A rung for each reflector, in two rounds; in a trial all reflectors to be decided have the same one."""
-    first = [trials.run(rung, "model", {"model": _filled(reflectors, rung)}) for rung in ladder]
-    free = [i for i, r in enumerate(reflectors) if r.model == "auto"]
-    close = {i: finalists([trial.inside[i] for trial in first]) for i in free}
-    again = [ladder[k] for k in sorted({k for i in free if len(close[i]) > 1 for k in close[i]})]
-    longer = {rung: trials.run(rung, "model", {"model": _filled(reflectors, rung)}, _ROUNDS) for rung in again}
-    models = [r.model for r in reflectors]
-    for i in free:
-        named = [ladder[k] for k in close[i]]
-        models[i] = named[best([longer[n].inside[i] for n in named]) if len(named) > 1 else 0]
-    return models
+    """A rung for each reflector, by trials that get longer for fewer; in a trial all reflectors to be decided have the
+    same one."""
+
+    def run(left: dict[int, list[int]], rounds: int) -> dict[int, list[list[float | None]]]:
+        tried = {k: {"model": _filled(reflectors, ladder[k])} for k in sorted(set().union(*left.values()))}
+        done = {k: trials.run(ladder[k], "model", settings, rounds) for k, settings in tried.items()}
+        return {i: [done[k].inside[i] for k in rungs] for i, rungs in left.items()}
+
+    left = {i: list(range(len(ladder))) for i, r in enumerate(reflectors) if r.model == "auto"}
+    scores = run(left, 1)
+    for turn, most in enumerate(_FINALISTS, 1):
+        left |= {i: [left[i][k] for k in finalists(scores[i], most)] for i in scores}
+        scores = run({i: rungs for i, rungs in left.items() if len(rungs) > 1}, 2**turn)
+    taken = {i: ladder[rungs[best(scores[i]) if i in scores else 0]] for i, rungs in left.items()}
+    return [taken.get(i, r.model) for i, r in enumerate(reflectors)]
 
 
 def _photographs(trials: "_Trials", config: TrainConfig, chosen: dict, taken: dict[str, list[str]]) -> dict:
