@@ -36,11 +36,11 @@ _NETWORKS = ("neural", "quadric+neural")
 LEAST_GAIN = 0.2
 """dB that a more complex candidate must gain at least."""
 
-_STEPS, _HURRIED_STEPS = 250, 80
+_STEPS, _HURRIED_STEPS = 250, 50
 """Steps of a trial, and where there are less than `_PATIENT` minutes."""
 _FINALISTS = (4, 2)
 """Rungs at most that go on for twice as many steps, then again: a mirror's lead over a static cloud grows with them."""
-_CLOSE = 0.3
+_CLOSE = 0.6
 """dB below the rule's pick at most, for a rung to go on with it."""
 _SIZE, _PATCH = 200, 100
 """Longer side of the images, and of the patches, in trials."""
