@@ -126,7 +126,7 @@ def test_a_lead_that_only_a_longer_trial_shows_decides(tmp_path, monkeypatch, ca
 
     def run(trials, name, question, settings, rounds=1):
         tried.append((name, rounds))
-        score = {"none": 20.0, "concave": 20.1 + 2 * (rounds - 1)}.get(name, 18.0)
+        score = {"none": 20.0, "concave": 20.1 + 0.2 * (rounds - 1)}.get(name, 18.0)
         trials.done.append(Trial(name, question, settings, rounds, 1.0, 80, 100, 10, [[score, score]], [score, score]))
         return trials.done[-1]
 
