@@ -37,7 +37,7 @@ def sample_visual_hull(
         masks: names of views, their cameras, and where they see the reflector.
     """
     grid, cell = _grid(volume)
-    inside = _soft_inside(volume, grid.reshape(-1, 3), masks).reshape(grid.shape[:3])
+    inside = _soft_inside(volume, grid.reshape(-1, 3), masks, cell).reshape(grid.shape[:3])
     points, normals = _crossings(grid, inside, cell)
     if not len(points):
         return volume.sample_surface(count, rng)
@@ -46,6 +46,7 @@ def sample_visual_hull(
     chosen = rng.choice(len(points), count, p=density / density.sum())
     spread = rng.uniform(-0.5, 0.5, (count, 3)) * cell
     spread -= (spread * normals[chosen]).sum(1, keepdims=True) * normals[chosen]
+    spread[~volume.contains(points[chosen] + spread)] = 0
     return points[chosen] + spread, normals[chosen]
 
 
@@ -61,21 +62,28 @@ def _soft_inside(
     volume: ReflectionVolume,
     points: Float[np.ndarray, "n 3"],
     masks: Sequence[tuple[str, Camera, Bool[np.ndarray, "height width"]]],
+    cell: float,
 ) -> Float[np.ndarray, "n"]:
-    """1 inside, 0 outside of all masks together, with soft edges; 0 outside of the volume."""
+    """1 inside, 0 outside of all masks together, with soft edges; at `_LEVEL` on the volume's planes, 0 outside."""
     from scipy.ndimage import gaussian_filter, map_coordinates
 
     inside = np.zeros(len(points))
-    near = np.flatnonzero(volume.scaled(1.05).contains(points))  # soft edges cut before the volume's planes do
-    inside[near] = 1
+    near = np.flatnonzero(volume.scaled(1.1).contains(points))
+    depth = -np.concatenate([_height(volume, part) for part in np.array_split(points[near], 1 + len(near) // 4096)])
+    inside[near] = np.clip(_LEVEL * (1 + depth / cell), 0, 1)
     for _, camera, mask in masks:
         left = near[inside[near] > 0]
-        pixels, depth = camera.project(points[left])
+        pixels, distance = camera.project(points[left])
         soft = gaussian_filter(mask.astype(np.float32), _BLUR)
         seen = map_coordinates(soft, (pixels - 0.5).T[::-1], order=1, mode="constant", cval=np.nan)
-        unknown = np.isnan(seen) | (depth <= 0)  # beside the picture: nothing is said
+        unknown = np.isnan(seen) | (distance <= 0)  # beside the picture: nothing is said
         inside[left] = np.minimum(inside[left], np.where(unknown, 1, seen))
     return inside
+
+
+def _height(volume: ReflectionVolume, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+    """How far points lie outside of the nearest bounding plane; negative inside."""
+    return (points @ volume.halfspaces[:, :3].T + volume.halfspaces[:, 3]).max(1)
 
 
 def _crossings(
