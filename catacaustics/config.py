@@ -100,7 +100,7 @@ class TrainConfig:
     """Share of patches centred on a reflector; the others are anywhere."""
     primary_points: int | None = None
     """Primary points at the start, at most; the cloud is thinned at random. Left out, the images' size decides, and
-    trials, where a model is auto and there are 10 minutes or more."""
+    trials, where a model is auto and there are 30 minutes or more."""
     max_primary_points: int = 1_000_000
     """Densification never exceeds this."""
     reflection_points: int | None = None
@@ -139,7 +139,7 @@ class TrainConfig:
     warp_weight_decay: float = 1e-2
     refine_poses: bool | None = None
     """Learn small corrections of the training cameras' poses. Left out: no, or as trials decide where a model is auto
-    and there are 10 minutes or more."""
+    and there are 30 minutes or more."""
     exposure: bool | None = None
     """Learn exposure and white balance (three gains) of each training photograph; left out, as refine_poses."""
     lr_pose: float = 3e-4

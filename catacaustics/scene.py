@@ -286,20 +286,22 @@ class Scene(nn.Module):
 
         with torch.no_grad():
             shown = show(cloud.positions)
-            footprints = _stretched(cloud.log_footprints.exp(), shown)
+            footprints = _stretched(cloud.log_footprints.exp(), shown.stretch)
             near = points_in_view(shown.positions, footprints, camera, viewport, self.splatting)
             if shown.visible is not None:
                 near = near[shown.visible[near]]
-        # Only points that can land in the viewport are warped with gradients.
+            normals, stretch, start = (
+                None if t is None else t.index_select(0, near) for t in (shown.normals, shown.stretch, shown.start)
+            )
+        # Only points that can land in the viewport are warped with gradients, and only positions have them.
         positions, _, log_footprints, logits, features = _rows(cloud, near)
-        shown = show(positions, None if shown.start is None else shown.start[near])
-        displayed, normals = shown.positions, shown.normals
+        displayed = show(positions, start).positions
         if motion is not None:
             displayed = motion.apply(displayed, center)
             normals = None if normals is None else normals @ motion.rotation.detach().T
         if normals is None:
             normals = torch.nn.functional.normalize(center - displayed.detach(), dim=1)
-        footprints = _stretched(log_footprints.exp(), shown)
+        footprints = _stretched(log_footprints.exp(), stretch)
         return ReflectionDisks(near, displayed, normals, footprints, torch.sigmoid(logits), features)
 
     def save(self, path: Path, extra: dict[str, Tensor] | None = None, notes: dict | None = None) -> None:
@@ -345,8 +347,8 @@ def _weighted(layers: Layers) -> tuple[Tensor, Tensor]:
     return (1 - rho * (1 - layers.reflection_transmittance[..., None])) * layers.primary, rho * layers.reflection
 
 
-def _stretched(footprints: Tensor, shown: Displayed) -> Tensor:
-    return footprints if shown.stretch is None else footprints * shown.stretch
+def _stretched(footprints: Tensor, stretch: Tensor | None) -> Tensor:
+    return footprints if stretch is None else footprints * stretch
 
 
 def _rows(cloud: PointParameters, index: Tensor) -> list[Tensor]:

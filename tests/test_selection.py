@@ -120,6 +120,13 @@ def test_a_short_training_does_not_try_networks_and_says_so(tmp_path, monkeypatc
     assert "Not tried" in (config.run / "model_choice.html").read_text()
 
 
+@pytest.mark.parametrize(("minutes", "steps"), [(2.0, 50), (15.0, 125), (30.0, 250), (None, 250)])
+def test_trials_are_as_long_as_the_training_can_afford(tmp_path, minutes, steps):
+    capture = open_capture(make_toy_capture(tmp_path / "capture"))
+    config = TrainConfig(capture.root, tmp_path / "run", minutes=minutes)
+    assert selection._Trials(capture, [], config).config.iterations == steps
+
+
 def test_a_lead_that_only_a_longer_trial_shows_decides(tmp_path, monkeypatch, capsys):
     capture = open_capture(make_toy_capture(tmp_path / "capture"))
     tried = []

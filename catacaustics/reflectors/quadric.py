@@ -31,11 +31,11 @@ class Specular(NamedTuple):
     """Points of reflection: differentiable `points`; `visible` where camera and source face the mirror there and the
     path is stationary; `jacobian` (no gradients), the map from displacements of the source to displacements of the
     displayed point, which lies on the ray at the length of the path; `start`, the solution on the unit sphere, which
-    saves solving again for the same arguments."""
+    saves solving again for the same arguments: then `visible` and `jacobian` are None, as they are known."""
 
     points: Float[Tensor, "n 3"]
-    visible: Bool[Tensor, "n"]
-    jacobian: Float[Tensor, "n 3 3"]
+    visible: Bool[Tensor, "n"] | None
+    jacobian: Float[Tensor, "n 3 3"] | None
     start: Float[Tensor, "n 3"]
 
 
@@ -133,6 +133,8 @@ def specular_points(
     step = _solve2(hessian, torch.einsum("nij,ni->nj", basis, gradient))
     moved = u - torch.einsum("nij,nj->ni", basis, _shortened(step, _MAX_STEP))
     points = center + torch.nn.functional.normalize(moved, dim=1) @ axes.T
+    if start is not None:
+        return Specular(points, None, None, u)
     with torch.no_grad():
         normal = torch.nn.functional.normalize(u @ torch.linalg.inv(axes), dim=1) * (-1 if concave else 1)
         cosine = torch.minimum((normal * path.to_camera).sum(1), (normal * path.to_source).sum(1))

@@ -1,7 +1,7 @@
 """Warps: where a reflection point is displayed for a camera centre. A ladder, from no motion to optics to a network.
 
 Every warp is a module with forward(points (n, 3), center (3,), start) -> Displayed; `start` is what an earlier call
-returned for the same points and centre, and saves work. What the points are depends on the rung:
+returned for the same points and centre: only positions are worked out then. What the points are depends on the rung:
 of `plane` and the quadrics they are the world positions of what is mirrored, of the others positions where it is seen.
 """
 
@@ -137,8 +137,11 @@ class QuadricWarp(nn.Module):
         near = ray.norm(dim=1, keepdim=True).clamp_min(1e-12)
         direction = ray / near
         length = near + (points - found.points).norm(dim=1, keepdim=True)
+        shown = Displayed(center + length * direction, start=found.start, near=near.detach()[:, 0])
+        if found.jacobian is None:
+            return shown
         normals, stretch = tilted_disks(found.jacobian, -direction.detach())
-        return Displayed(center + length * direction, normals, stretch, found.visible, found.start, near.detach()[:, 0])
+        return shown._replace(normals=normals, stretch=stretch, visible=found.visible)
 
 
 class NeuralWarp(nn.Module):

@@ -36,8 +36,8 @@ _NETWORKS = ("neural", "quadric+neural")
 LEAST_GAIN = 0.2
 """dB that a more complex candidate must gain at least."""
 
-_STEPS, _HURRIED_STEPS = 250, 50
-"""Steps of a trial, and where there are less than `_PATIENT` minutes."""
+_STEPS, _LEAST_STEPS = 250, 50
+"""Steps of a trial; with less than `_PATIENT` minutes fewer in proportion: trials take about a third of them."""
 _FINALISTS = (4, 2)
 """Rungs at most that go on for twice as many steps, then again: a mirror's lead over a static cloud grows with them."""
 _CLOSE = 0.6
@@ -46,7 +46,7 @@ _SIZE, _PATCH = 200, 100
 """Longer side of the images, and of the patches, in trials."""
 _FACTORS = (0.5, 1.0, 2.0)
 """Sizes of a cloud that are tried, in units of `usual_points`."""
-_PATIENT = 10
+_PATIENT = 30
 """Minutes of training from which on networks, sizes of clouds and corrections of the photographs are tried."""
 _VIEWS = 8
 """Validation views at most."""
@@ -188,6 +188,12 @@ def _hurried(config: TrainConfig) -> bool:
     return config.minutes is not None and config.minutes < _PATIENT
 
 
+def _steps(config: TrainConfig) -> int:
+    if config.minutes is None or not _hurried(config):
+        return _STEPS
+    return max(_LEAST_STEPS, round(_STEPS * config.minutes / _PATIENT))
+
+
 def _filled(reflectors: list, rung: str) -> tuple[str, ...]:
     return tuple(rung if r.model == "auto" else r.model for r in reflectors)
 
@@ -213,7 +219,7 @@ class _Trials:
             config,
             **{k: n and max(500, int(n * (size / config.image_size) ** 2)) for k, n in named.items()},
             image_size=size,
-            iterations=min(_HURRIED_STEPS if _hurried(config) else _STEPS, config.iterations),
+            iterations=min(_steps(config), config.iterations),
             minutes=None,
             patch=_PATCH,
             accumulate=1,
