@@ -67,12 +67,9 @@ def _soft_inside(
     """1 inside, 0 outside of all masks together, with soft edges; at `_LEVEL` on the volume's planes, 0 outside."""
     from scipy.ndimage import gaussian_filter, map_coordinates
 
-    inside = np.zeros(len(points))
-    near = np.flatnonzero(volume.scaled(1.1).contains(points))
-    depth = -np.concatenate([_height(volume, part) for part in np.array_split(points[near], 1 + len(near) // 4096)])
-    inside[near] = np.clip(_LEVEL * (1 + depth / cell), 0, 1)
+    inside = np.clip(_LEVEL * (1 - volume.heights(points) / cell), 0, 1)
     for _, camera, mask in masks:
-        left = near[inside[near] > 0]
+        left = np.flatnonzero(inside)
         pixels, distance = camera.project(points[left])
         soft = gaussian_filter(mask.astype(np.float32), _BLUR)
         seen = map_coordinates(soft, (pixels - 0.5).T[::-1], order=1, mode="constant", cval=np.nan)
@@ -81,18 +78,13 @@ def _soft_inside(
     return inside
 
 
-def _height(volume: ReflectionVolume, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
-    """How far points lie outside of the nearest bounding plane; negative inside."""
-    return (points @ volume.halfspaces[:, :3].T + volume.halfspaces[:, 3]).max(1)
-
-
 def _crossings(
     grid: Float[np.ndarray, "x y z 3"], inside: Float[np.ndarray, "x y z"], cell: float
 ) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
     """Where edges of the grid cross the surface, and the normals there."""
     from scipy.ndimage import gaussian_filter
 
-    slope = np.stack(np.gradient(gaussian_filter(inside, 1.0), cell), -1)
+    slope = np.stack([*np.gradient(gaussian_filter(inside, 1.0), cell)], -1)
     points, slopes = [], []
     for axis in range(3):
         a, b = (np.moveaxis(inside, axis, 0)[part] for part in (slice(None, -1), slice(1, None)))

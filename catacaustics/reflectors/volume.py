@@ -63,12 +63,15 @@ class ReflectionVolume:
         """Whether points lie inside or on the surface (to 1e-7 of the radius)."""
         flat = points.reshape(-1, 3)
         inside = np.linalg.norm(flat - self.center, axis=-1) <= (1 + 1e-6) * self.radius
-        near = np.flatnonzero(inside)
-        normals, limits = self.halfspaces[:, :3], 1e-7 * self.radius - self.halfspaces[:, 3]
-        for start in range(0, len(near), 4096):  # thousands of half-spaces times points would not fit in memory
-            block = near[start : start + 4096]
-            inside[block] = (flat[block] @ normals.T <= limits).all(-1)
+        inside[inside] = self.heights(flat[inside]) <= 1e-7 * self.radius
         return inside.reshape(points.shape[:-1])
+
+    def heights(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
+        """How far points lie outside of the farthest bounding plane, in world units; negative inside the volume."""
+        normals, offsets = self.halfspaces[:, :3], self.halfspaces[:, 3]
+        # Thousands of half-spaces times points would not fit in memory.
+        blocks = np.array_split(points, 1 + len(points) // 4096)
+        return np.concatenate([(block @ normals.T + offsets).max(1) for block in blocks])
 
     @cached_property
     def _cross(self) -> np.ndarray:
