@@ -91,7 +91,7 @@ def ablate(config: AblateConfig) -> dict[str, Any]:
 def _rows(config: AblateConfig, capture: Capture, volumes: list[ReflectionVolume]) -> dict[str, dict[str, Any]]:
     train = TrainConfig(config.capture, config.out, image_size=config.image_size)
     usual = usual_points(capture, volumes, train)["reflection_points"]
-    rows = {k: dict(v) for k, v in _ROWS.items()} | {r: {"model": (r,)} for r in _RUNGS}
+    rows: dict[str, dict[str, Any]] = {k: dict(v) for k, v in _ROWS.items()} | {r: {"model": (r,)} for r in _RUNGS}
     rows["half warp"]["warp_width"] = train.warp_width // 2
     for rung in config.cloud_rungs:
         for share in _CLOUDS:

@@ -74,7 +74,7 @@ def displayed_points(
 def _pair_errors(scene: Scene, capture: Capture, first: View, second: View) -> tuple[np.ndarray, np.ndarray]:
     """Angles between displayed and true directions in the second view, for points that show something in the first;
     and what the angles would be if reflections stuck to the surface."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     truth = [read_truth(capture.root, v.name) for v in (first, second)]
     errors, still = [], []
@@ -94,7 +94,7 @@ def _pair_errors(scene: Scene, capture: Capture, first: View, second: View) -> t
         if not usable.any() or not region.any():
             continue
         rays = normalize(second.camera.ray_directions(pixel_centers(second.camera.viewport)))[region]
-        gap, nearest = cKDTree(truth[1].source[region]).query(sources[usable])
+        gap, nearest = map(np.asarray, KDTree(truth[1].source[region]).query(sources[usable]))
         same = gap < _SAME_PLACE * np.linalg.norm(sources[usable] - volume.center, axis=1)
         true = rays[nearest[same]]
         shown = normalize(after[usable][same] - second.camera.center)

@@ -111,11 +111,9 @@ def clone_reflector(
             setattr(primary, name, nn.Parameter(torch.cat([parameter[torch.from_numpy(~cleared)], rows])))
     warp = _moved_warp(edited, index, scale, turn, move, resting)
     kept = [i for i in range(len(scene.volumes)) if i not in replaced]
-    edited.reflections = nn.ModuleList(
-        [*(edited.reflections[i] for i in kept), copy.deepcopy(scene.reflections[index])]
-    )
-    edited.warps = nn.ModuleList([*(edited.warps[i] for i in kept), warp])
-    edited.volumes = [*(scene.volumes[i] for i in kept), moved]
+    clouds = [*(edited.reflections[i] for i in kept), copy.deepcopy(scene.reflections[index])]
+    warps = [*(edited.warps[i] for i in kept), warp]
+    edited.set_reflectors(clouds, warps, [*(scene.volumes[i] for i in kept), moved])
     return edited
 
 
@@ -193,12 +191,12 @@ def adjust_reflections(
     """Dim (strength below 1), strengthen or tint a reflector's reflections; strength 0 erases them, and its surface
     shows what was learned of it."""
     edited = copy.deepcopy(scene)
-    cloud: PointParameters = edited.reflections[index]  # pyright: ignore[reportAssignmentType]
+    cloud = edited.reflections[index]
     with torch.no_grad():
         if strength == 0:
             cloud.opacity_logits.fill_(_HIDDEN)
         else:
-            cloud.features *= strength
+            cloud.features.mul_(strength)
             cloud.features[:, :3] *= torch.tensor(tint, device=scene.device)
     return edited
 
@@ -228,7 +226,7 @@ def replace_surroundings(
             "train with one of these models",
         )
     edited = copy.deepcopy(scene)
-    cloud: PointParameters = edited.reflections[index]  # pyright: ignore[reportAssignmentType]
+    cloud = edited.reflections[index]
     with torch.no_grad():
         center = torch.from_numpy(scene.volumes[index].center).to(cloud.positions)
         upright = torch.from_numpy(_upright(up, turn)).to(center)

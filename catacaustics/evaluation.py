@@ -141,10 +141,11 @@ def _measure(
         "height": camera.height,
         "seconds": seconds,
     }
-    learned = [bool(run.config.get(key)) for key in ("refine_poses", "exposure")]
-    if any(learned):
+    poses, exposure = (bool(run.config.get(key)) for key in ("refine_poses", "exposure"))
+    if poses or exposure:
         target = torch.from_numpy(photo).to(run.scene.device)
-        aligned = align_view(run.scene, camera, target, *learned, scene_extent(run.capture)).render(run.scene, camera)
+        corrections = align_view(run.scene, camera, target, poses, exposure, scene_extent(run.capture))
+        aligned = corrections.render(run.scene, camera)
         again = compare(aligned.cpu().numpy(), photo, mask)
         row["whole_aligned"] = again.whole.as_dict()
         row["inside_aligned"] = again.inside.as_dict() if again.inside else None

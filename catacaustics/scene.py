@@ -6,10 +6,10 @@ reflection is: the paper does so everywhere, but a volume can be larger than wha
 blended with the primary cloud's transmittance. (Paper sections 4 and 5; the sense of rho is ours.)
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, MutableSequence, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple
+from typing import NamedTuple, cast
 
 import numpy as np
 import torch
@@ -139,6 +139,9 @@ class Scene(nn.Module):
         splatting: cut-offs of the splatter.
     """
 
+    reflections: MutableSequence[PointParameters]
+    warps: MutableSequence[nn.Module]
+
     def __init__(
         self,
         primary: PointParameters,
@@ -151,9 +154,7 @@ class Scene(nn.Module):
     ):
         super().__init__()
         self.primary = primary
-        self.reflections = nn.ModuleList(reflections)
-        self.warps = nn.ModuleList(warps)
-        self.volumes = volumes
+        self.set_reflectors(reflections, warps, volumes)
         self.environment = environment
         self.renderer = renderer
         self.splatting = splatting
@@ -161,6 +162,14 @@ class Scene(nn.Module):
     @property
     def device(self) -> torch.device:
         return self.primary.positions.device
+
+    def set_reflectors(
+        self, reflections: list[PointParameters], warps: list[nn.Module], volumes: list[ReflectionVolume]
+    ) -> None:
+        """Replace all reflectors: one cloud, warp and volume each."""
+        self.reflections = cast("MutableSequence[PointParameters]", nn.ModuleList(reflections))
+        self.warps = cast("MutableSequence[nn.Module]", nn.ModuleList(warps))
+        self.volumes = volumes
 
     def layers(
         self,
@@ -274,7 +283,6 @@ class Scene(nn.Module):
         round; where the warp does not shape their images, disks face the camera."""
         viewport = viewport or camera.viewport
         cloud, warp = self.reflections[index], self.warps[index]
-        assert isinstance(cloud, PointParameters)
         center, warp_center = self._center(camera), self._center(warp_camera or camera)
         decoupled = warp_camera is not None and not torch.equal(center, warp_center)
         if motion is not None:

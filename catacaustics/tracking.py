@@ -116,9 +116,9 @@ def spread_points(scene: Scene, index: int, camera: Camera, count: int, least_we
             "a view with the reflector in it",
             "choose another view with --view",
         )
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
-    room = cKDTree(rim).query(free)[0]
+    room = KDTree(rim).query(free)[0]
     disks, chosen = _all_disks(scene, camera), list[int]()
     for _ in range(20 * count):
         pixel = free[room.argmax()]
@@ -250,6 +250,7 @@ def true_pixels(
         middle = run_from_truth.apply(np.array(geometry["center"], float)[None])[0]
         tensors = [torch.from_numpy(np.ascontiguousarray(a)) for a in (points, center, middle, axes)]
         found = specular_points(tensors[0], tensors[1], tensors[2], tensors[3])
+        assert found.visible is not None  # solved anew
         positions, visible = found.points.numpy(), found.visible.numpy()
     else:
         raise UserError(

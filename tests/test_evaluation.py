@@ -279,7 +279,10 @@ def test_a_scene_from_its_file_is_evaluated_as_it_was_saved(capture, volume, tmp
     rng = np.random.default_rng(0)
     reflector = Reflector(volume, "sphere")
     warps = start_warps(capture, [reflector], config)
-    seeds = [primary_seeds(capture, [reflector], config, rng), reflection_seeds(capture, volume, warps[0], config, rng)]
+    seeds = [
+        primary_seeds(capture, [reflector], config.primary_points, rng),
+        reflection_seeds(capture, volume, warps[0], config.reflection_points, rng),
+    ]
     scene = initial_scene(capture, [volume], warps, seeds, 1.0, config)
     run = make_run(tmp_path / "run", capture)
     scene.save(run / "scene.safetensors")

@@ -31,10 +31,12 @@ def build(capture, **options):
     config = TrainConfig(capture.root, capture.root / "run", **(settings | options))
     reflectors = named_reflectors([build_volume(capture, r) for r in capture.reflectors], config.model)
     rng = np.random.default_rng(0)
-    seeds = [primary_seeds(capture, reflectors, config, rng)]
+    seeds = [primary_seeds(capture, reflectors, config.primary_points, rng)]
     reflectors = [r for r in reflectors if r.model != "none"]
     warps, volumes = start_warps(capture, reflectors, config), [r.volume for r in reflectors]
-    seeds += [reflection_seeds(capture, v, w, config, rng) for v, w in zip(volumes, warps, strict=True)]
+    seeds += [
+        reflection_seeds(capture, v, w, config.reflection_points, rng) for v, w in zip(volumes, warps, strict=True)
+    ]
     return initial_scene(capture, volumes, warps, seeds, 1.0, config)
 
 

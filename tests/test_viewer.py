@@ -39,8 +39,8 @@ def scene(capture):
     config = TrainConfig(capture.root, capture.root, primary_points=3000, reflection_points=300, environment_width=20)
     reflector, rng = Reflector(build_volume(capture, "ball"), "sphere"), np.random.default_rng(0)
     warps = start_warps(capture, [reflector], config)
-    seeds = [primary_seeds(capture, [reflector], config, rng)]
-    seeds += [reflection_seeds(capture, reflector.volume, warps[0], config, rng)]
+    seeds = [primary_seeds(capture, [reflector], config.primary_points, rng)]
+    seeds += [reflection_seeds(capture, reflector.volume, warps[0], config.reflection_points, rng)]
     return initial_scene(capture, [reflector.volume], warps, seeds, 1.0, config)
 
 

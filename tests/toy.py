@@ -92,7 +92,10 @@ def scene_of(capture: Capture, model: str) -> Scene:
     reflectors = named_reflectors([build_volume(capture, "ball")], config.model)
     rng = np.random.default_rng(0)
     volume, warps = reflectors[0].volume, start_warps(capture, reflectors, config)
-    seeds = [primary_seeds(capture, reflectors, config, rng), reflection_seeds(capture, volume, warps[0], config, rng)]
+    seeds = [
+        primary_seeds(capture, reflectors, config.primary_points, rng),
+        reflection_seeds(capture, volume, warps[0], config.reflection_points, rng),
+    ]
     with mock.patch.object(initialize, "start_shapes"):  # fitting shapes to photographs takes seconds
         scene = initialize.initial_scene(capture, [volume], warps, seeds, 1.0, config)
     with torch.no_grad():

@@ -10,7 +10,7 @@ import shutil
 import tempfile
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import numpy as np
 import tyro
@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from catacaustics.capture.dataset import Capture, View, open_capture
 from catacaustics.catacaustic import displayed_points
-from catacaustics.config import TrainConfig
+from catacaustics.config import Model, TrainConfig
 from catacaustics.files import write_json
 from catacaustics.geometry import rigid
 from catacaustics.reflectors.volume import ReflectionVolume, build_volume
@@ -44,12 +44,21 @@ class Stress:
     """
 
     capture: Annotated[Path, tyro.conf.Positional]
-    model: str = "sphere"
+    model: Model = "sphere"
     seeds: int = 20
     iterations: int = 200
     image_size: int = 160
     refine_poses: bool = True
     json: Path | None = None
+
+
+class Run(NamedTuple):
+    """One training: on which capture and volume, with which seed, and whether it learns pose corrections."""
+
+    capture: Capture
+    volume: ReflectionVolume
+    seed: int = 0
+    poses: bool = False
 
 
 def shifted_volume(volume: ReflectionVolume, shift: np.ndarray) -> ReflectionVolume:
@@ -110,14 +119,13 @@ def main(config: Stress) -> None:
     rng = np.random.default_rng(0)
     direction = rng.standard_normal(3)
     direction *= 0.2 * volume.radius / np.linalg.norm(direction)
-    base = {"capture": capture, "volume": volume, "seed": 0, "poses": False}
-    runs = {f"seed {i}": base | {"seed": i} for i in range(config.seeds)}
-    runs["volume 30 % too large"] = base | {"volume": volume.scaled(1.3)}
-    runs["volume shifted by 20 %"] = base | {"volume": shifted_volume(volume, direction)}
+    runs = {f"seed {i}": Run(capture, volume, seed=i) for i in range(config.seeds)}
+    runs["volume 30 % too large"] = Run(capture, volume.scaled(1.3))
+    runs["volume shifted by 20 %"] = Run(capture, shifted_volume(volume, direction))
     noisy = noisy_poses(capture, 1.0, rng)
-    runs["poses noisy by 1 px"] = base | {"capture": noisy}
+    runs["poses noisy by 1 px"] = Run(noisy, volume)
     if config.refine_poses:
-        runs["poses noisy by 1 px, refined"] = base | {"capture": noisy, "poses": True}
+        runs["poses noisy by 1 px, refined"] = Run(noisy, volume, poses=True)
     results = {}
     for name, run in runs.items():
         folder = Path(tempfile.mkdtemp(prefix="stress-"))
@@ -129,12 +137,12 @@ def main(config: Stress) -> None:
             image_size=config.image_size,
             patch=config.image_size,
             environment_width=200,
-            seed=run["seed"],
-            refine_poses=run["poses"],
+            seed=run.seed,
+            refine_poses=run.poses,
         )
-        scene = fit(run["capture"], named_reflectors([run["volume"]], train.model), train)
+        scene = fit(run.capture, named_reflectors([run.volume], train.model), train)
         shutil.rmtree(folder)
-        results[name] = {"inside": score(scene, capture, volume, config.image_size, align=run["poses"])}
+        results[name] = {"inside": score(scene, capture, volume, config.image_size, align=run.poses)}
         results[name]["strayed"] = strayed(scene, capture)
         shape = getattr(scene.warps[0], "shape", None)
         if shape is not None:

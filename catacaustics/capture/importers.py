@@ -102,7 +102,7 @@ def import_capture(
     split = default_split([view.name for view in views], held_out_every)
     for path in (Path(capture) / "split.json", folder / "split.json"):
         old = read_json(path) if path.is_file() else None
-        if _split_names(old) == _split_names(split):
+        if old is not None and _split_names(old) == _split_names(split):
             split = old
             break
     write_capture(capture, views, split, model.points, model.colors)

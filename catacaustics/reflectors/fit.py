@@ -164,7 +164,7 @@ def surroundings(
     In each of `count` directions stands the nearest known point; where there is none, a point as far as the known
     ones in neighbouring directions, at least `far` where none is near, of the colour `fallback`.
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     directions = sphere_directions(count)
     offsets = points - volume.center
@@ -174,14 +174,14 @@ def surroundings(
     distance, color = np.full(count, np.nan), np.tile(fallback, (count, 1))
     if len(known):
         # The nearest of the points within a direction's own cone; all points of a cone are asked, nearest last.
-        cell = cKDTree(directions).query(known)[1]
+        cell = np.asarray(KDTree(directions).query(known)[1])
         order = np.argsort(-distances[outside], kind="stable")
         distance[cell[order]] = distances[outside][order]
         color[cell[order]] = colors[outside][order]
     filled = np.isfinite(distance)
     if filled.any() and not filled.all():
-        gap, nearest = cKDTree(directions[filled]).query(directions[~filled], k=min(4, int(filled.sum())))
-        gap, nearest = gap.reshape(len(gap), -1), nearest.reshape(len(nearest), -1)
+        found = KDTree(directions[filled]).query(directions[~filled], k=min(4, int(filled.sum())))
+        gap, nearest = (np.reshape(part, (int((~filled).sum()), -1)) for part in found)
         guess = np.median(distance[filled][nearest], axis=1)
         close = gap[:, 0] < 0.25
         distance[~filled] = np.where(close, guess, np.maximum(guess, far))

@@ -294,11 +294,13 @@ def warp_from_state(state: dict[str, Tensor]) -> nn.Module:
             return DecoupledWarp(inner, state["offset"], float(state["gain"]), state["pivot"], float(state["strength"]))
         return MovedWarp(inner, float(state["scale"]), state["rotation"], state["shift"])
     if "quadric.start_axes" in state:
-        parts = {
-            part: warp_from_state({k.removeprefix(f"{part}."): v for k, v in state.items() if k.startswith(f"{part}.")})
-            for part in ("quadric", "neural")
-        }
-        return QuadricNeuralWarp(**parts)
+        quadric, neural = (
+            warp_from_state({k.removeprefix(part): v for k, v in state.items() if k.startswith(part)})
+            for part in ("quadric.", "neural.")
+        )
+        assert isinstance(quadric, QuadricWarp)
+        assert isinstance(neural, NeuralWarp)
+        return QuadricNeuralWarp(quadric, neural)
     if "start_axes" in state:
         sphere = len(state["log_radii"]) == 1
         warp: nn.Module = QuadricWarp(state["start_center"], state["start_axes"], sphere, bool(state["concave"]))

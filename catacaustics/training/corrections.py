@@ -24,6 +24,8 @@ class Corrections(nn.Module):
         extent: radius of the cameras; unit of the shifts.
     """
 
+    extent: Tensor
+
     def __init__(self, count: int, poses: bool, exposure: bool, extent: float):
         super().__init__()
         self.register_buffer("extent", torch.tensor(extent))

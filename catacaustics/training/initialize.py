@@ -84,12 +84,12 @@ def neighbor_footprints(positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray
 
     Outliers are capped at 16 times the median, so that a stray point does not cover half the image.
     """
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     if len(positions) < 2:
         return np.full(len(positions), 1e-4, np.float32)
     k = min(4, len(positions))
-    distances = cKDTree(positions).query(positions, k=k)[0][:, 1:]
+    distances = KDTree(positions).query(positions, k=k)[0][:, 1:]
     squared = 0.5 * (distances**2).mean(1)
     median = np.median(squared)
     return np.clip(squared, 1e-4 * median + 1e-16, 16 * median).astype(np.float32)
@@ -117,20 +117,19 @@ def mean_reflector_color(capture: Capture, volume: ReflectionVolume) -> Float[np
     return np.mean(pixels, axis=0).astype(np.float32) if pixels else np.full(3, 0.5, np.float32)
 
 
-def primary_seeds(
-    capture: Capture, reflectors: list[Reflector], config: TrainConfig, rng: np.random.Generator
-) -> Seeds:
-    """Stereo points outside the reflectors, and points on the reflectors' surfaces, which carry rho, in random order.
+def primary_seeds(capture: Capture, reflectors: list[Reflector], count: int, rng: np.random.Generator) -> Seeds:
+    """At most `count` stereo points outside the reflectors, and points on the reflectors' surfaces, which carry rho, in
+    random order.
 
     Stereo has no points on a mirror, but something must hide what is behind it.
     """
     cloud = capture.points()
     for volume, _ in reflectors:
         cloud = cloud.select(~volume.contains(cloud.positions.astype(np.float64)))
-    if len(cloud) > config.primary_points:
-        cloud = cloud.select(rng.choice(len(cloud), config.primary_points, replace=False))
+    if len(cloud) > count:
+        cloud = cloud.select(rng.choice(len(cloud), count, replace=False))
     spacing2 = 2 * float(np.median(neighbor_footprints(cloud.positions))) if len(cloud) > 1 else 1e-4
-    budget = int(_SURFACE_SHARE * config.primary_points)
+    budget = int(_SURFACE_SHARE * count)
     wanted = [int(volume.area / spacing2) + 1 for volume, _ in reflectors]
     shrink = min(1.0, budget / max(sum(wanted), 1))
     parts = [(cloud.positions, cloud.normals, cloud.colors, np.full(len(cloud), 0.02))]
@@ -146,31 +145,29 @@ def primary_seeds(
 
 
 def reflection_seeds(
-    capture: Capture, volume: ReflectionVolume, warp: nn.Module, config: TrainConfig, rng: np.random.Generator
+    capture: Capture, volume: ReflectionVolume, warp: nn.Module, count: int, rng: np.random.Generator
 ) -> Seeds:
-    """Where reflection points start: for mirrors, on what the capture knows of the surroundings, evenly spread over
-    directions; otherwise at random on the surface of the reflection volume (paper section 4.2)."""
+    """Where `count` reflection points start: for mirrors, on what the capture knows of the surroundings, evenly spread
+    over directions; otherwise at random on the surface of the reflection volume (paper section 4.2)."""
     color = mean_reflector_color(capture, volume)
     if isinstance(warp, StaticWarp | NeuralWarp):
-        positions, normals = volume.sample_surface(config.reflection_points, rng)
+        positions, normals = volume.sample_surface(count, rng)
         colors = np.broadcast_to(color, positions.shape)
     else:
         cloud = capture.points()
-        count = config.reflection_points
+        plain = np.empty(0, int)
         if isinstance(warp, PlaneWarp):
             # A wide mirror shows what stands before any part of it: most sources are points of the cloud as they are.
             point, normal = warp.start_point.numpy(), warp.start_normal.numpy()
             front = np.flatnonzero((cloud.positions - point) @ normal > 0.02 * volume.radius)
-            whole = cloud.select(rng.permutation(front)[: int(_PLAIN_SHARE * count)])
-            count -= len(whole)
+            plain = rng.permutation(front)[: int(_PLAIN_SHARE * count)]
         far = 2 * max(float(np.linalg.norm(v.camera.center - volume.center)) for v in capture.train)
         positions, colors = surroundings(
-            cloud.positions.astype(np.float64), cloud.colors, volume, count, far, color, rng
+            cloud.positions.astype(np.float64), cloud.colors, volume, count - len(plain), far, color, rng
         )
-        if isinstance(warp, PlaneWarp):
-            positions, colors = np.r_[whole.positions, positions], np.r_[whole.colors, colors]
-            order = rng.permutation(len(positions))
-            positions, colors = positions[order], colors[order]
+        order = rng.permutation(len(plain) + len(positions))
+        positions = np.concatenate([cloud.positions[plain], positions])[order]
+        colors = np.concatenate([cloud.colors[plain], colors])[order]
         normals = np.zeros_like(positions)
     columns = (positions, normals, colors, np.zeros(len(positions)))
     return Seeds(*(np.ascontiguousarray(c, np.float32) for c in columns))
@@ -195,7 +192,7 @@ def start_cloud(seeds: Seeds, count: int, primary: bool, trainable_positions: bo
 def grow_cloud(cloud: PointParameters, seeds: Seeds, count: int) -> PointParameters:
     """Activate seeds up to `count`. A new point takes what its nearest trained point has learned (the change from that
     point's start), and every footprint shrinks with the spacing."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     old = len(cloud)
     if count <= old:
@@ -204,7 +201,7 @@ def grow_cloud(cloud: PointParameters, seeds: Seeds, count: int) -> PointParamet
     kind = (cloud.rho_logits is not None, cloud.positions.requires_grad)
     grown = start_cloud(seeds, count, *kind).to(device)
     before = start_cloud(seeds, old, *kind).to(device)
-    nearest = cKDTree(seeds.positions[:old]).query(seeds.positions[old:count])[1]
+    nearest = KDTree(seeds.positions[:old]).query(seeds.positions[old:count])[1]
     source = torch.cat([torch.arange(old), torch.from_numpy(nearest)]).to(device)
     with torch.no_grad():
         for name, parameter in grown.named_parameters():
@@ -230,7 +227,8 @@ def _start_warp(reflector: Reflector, centers: Float[np.ndarray, "m 3"], config:
     if model == "static":
         return StaticWarp()
     if model == "plane":
-        return PlaneWarp(*tensors(*fit_plane(volume, centers)), volume.radius)
+        point, normal = tensors(*fit_plane(volume, centers))
+        return PlaneWarp(point, normal, volume.radius)
     if model == "sphere":
         center, radius = fit_sphere(volume)
         return QuadricWarp(*tensors(center, radius * np.eye(3)), sphere=True)
@@ -240,7 +238,8 @@ def _start_warp(reflector: Reflector, centers: Float[np.ndarray, "m 3"], config:
         center, radius = fit_bowl(volume, centers)
         return QuadricWarp(*tensors(center, radius * np.eye(3)), sphere=False, concave=True)
     corners = np.concatenate([volume.vertices, centers])
-    neural = NeuralWarp(*tensors(corners.min(0), corners.max(0)), config.warp_layers, config.warp_width)
+    low, high = tensors(corners.min(0), corners.max(0))
+    neural = NeuralWarp(low, high, config.warp_layers, config.warp_width)
     if model == "neural":
         return neural
     return QuadricNeuralWarp(QuadricWarp(*tensors(*fit_ellipsoid(volume)), sphere=False), neural)
@@ -277,7 +276,8 @@ def initial_scene(
     start_shapes(scene, capture, config)
     if share < _SHAPE_SHARE:
         scene.primary, reflections = clouds(share)
-        scene.reflections = nn.ModuleList(reflections)
+        for i, cloud in enumerate(reflections):
+            scene.reflections[i] = cloud
     return scene
 
 

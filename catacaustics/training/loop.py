@@ -5,7 +5,7 @@ import json
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
 
@@ -99,12 +99,13 @@ def fit(
     run = Path(config.run)
     rng = np.random.default_rng(config.seed)
     usual = usual_points(capture, [r.volume for r in reflectors], config)
-    config = replace(config, **{k: n for k, n in usual.items() if getattr(config, k) is None})
-    seeds = [primary_seeds(capture, reflectors, config, rng)]
+    counts = {k: n if getattr(config, k) is None else getattr(config, k) for k, n in usual.items()}
+    seeds = [primary_seeds(capture, reflectors, counts["primary_points"], rng)]
     reflectors = [r for r in reflectors if r.model != "none"]
     warps = start_warps(capture, reflectors, config)
     volumes = [r.volume for r in reflectors]
-    seeds += [reflection_seeds(capture, v, w, config, rng) for v, w in zip(volumes, warps, strict=True)]
+    count = counts["reflection_points"]
+    seeds += [reflection_seeds(capture, v, w, count, rng) for v, w in zip(volumes, warps, strict=True)]
     state = _start(capture, volumes, warps, seeds, config, rng)
     try:
         _loop(state, capture, volumes, seeds, config, probe, watch)

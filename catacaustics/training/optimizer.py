@@ -6,6 +6,7 @@ keeps its value and its moments, and every row counts its own steps for the bias
 """
 
 import math
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor, nn
@@ -58,7 +59,7 @@ class RowAdam(torch.optim.Optimizer):
         super().__init__(groups, {"betas": betas, "eps": eps, "row_rates": None})
 
     @torch.no_grad()
-    def step(self, closure: None = None) -> None:
+    def step(self, closure: None = None) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         for group in self.param_groups:
             parameter = group["params"][0]
             if parameter.grad is None or group["lr"] == 0:
@@ -77,24 +78,19 @@ class RowAdam(torch.optim.Optimizer):
                 tensors = (value, gradient, state["step"], mean, square)
                 rows = [t.index_select(0, seen) for t in tensors]
                 scale = group["row_rates"]
-                _adam(*rows, group, 1.0 if scale is None else scale.index_select(0, seen))
+                _adam(rows, group, 1.0 if scale is None else scale.index_select(0, seen))
                 for whole, part in zip(tensors, rows, strict=True):
                     if whole is not gradient:
                         whole.index_copy_(0, seen, part)
             else:
-                _adam(parameter, parameter.grad, state["step"], state["exp_avg"], state["exp_avg_sq"], group)
+                moments = (state["exp_avg"], state["exp_avg_sq"])
+                _adam((parameter, parameter.grad, state["step"], *moments), group)
 
 
-def _adam(
-    value: Tensor,
-    gradient: Tensor,
-    step: Tensor,
-    mean: Tensor,
-    square: Tensor,
-    group: dict,
-    scale: Tensor | float = 1.0,
-) -> None:
-    """One step in place; `step` and `scale` have one number a row, or one for all."""
+def _adam(tensors: Sequence[Tensor], group: dict, scale: Tensor | float = 1.0) -> None:
+    """One step in place on value, gradient, step, mean and mean square; step and `scale` have one number a row, or one
+    for all."""
+    value, gradient, step, mean, square = tensors
     beta1, beta2 = group["betas"]
     step += 1
     mean.lerp_(gradient, 1 - beta1)

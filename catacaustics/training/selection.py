@@ -8,6 +8,7 @@ choice among rungs is close, the best of them go on for twice as many, and again
 """
 
 import shutil
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -79,7 +80,7 @@ class Trial:
     whole: list[float]
 
 
-def gain(new: list[float | None], old: list[float | None]) -> tuple[float, float]:
+def gain(new: Sequence[float | None], old: Sequence[float | None]) -> tuple[float, float]:
     """Mean of the paired differences over views, and the gain that noise could explain (never below LEAST_GAIN)."""
     differences = np.array(new, float) - np.array(old, float)
     differences = differences[np.isfinite(differences)]
@@ -89,7 +90,7 @@ def gain(new: list[float | None], old: list[float | None]) -> tuple[float, float
     return float(differences.mean()), float(max(LEAST_GAIN, 2 * error))
 
 
-def best(scores: list[list[float | None]]) -> int:
+def best(scores: Sequence[Sequence[float | None]]) -> int:
     """Index of the candidate to take: the first, unless a later one wins by more than the noise."""
     chosen = 0
     for i in range(1, len(scores)):
@@ -99,7 +100,7 @@ def best(scores: list[list[float | None]]) -> int:
     return chosen
 
 
-def finalists(scores: list[list[float | None]], most: int) -> list[int]:
+def finalists(scores: Sequence[Sequence[float | None]], most: int) -> list[int]:
     """Indices of the candidates that a longer trial could put first: the rule's pick and those close to it or above,
     `most` at most."""
     pick = best(scores)
