@@ -132,8 +132,11 @@ class TrainConfig:
     lr_footprint: float = 2e-2
     lr_opacity: float = 0.2
     lr_features: float = 2.5e-2
+    lr_environment: float = 5e-4
+    """Of the environment map's features, which start from what photographs show where the cloud is open. A texel is
+    seen by few of them and through gaps: with the rate of points it learns noise."""
     lr_final_share: float = 0.1
-    """Rates of normals, footprints, opacities and features decay to this share of their start."""
+    """Rates of normals, footprints, opacities, features and the environment map decay to this share of their start."""
     lr_network: float = 1e-3
     lr_network_final: float = 1e-4
     warp_weight_decay: float = 1e-2

@@ -32,6 +32,8 @@ def _rate(name: str, config: TrainConfig, extent: float, progress: float, warm_u
         return decay(config.lr_shape, config.lr_shape / 50)
     if name.startswith("reflections.") and kind == "positions":
         return decay(config.lr_source, config.lr_source / 100)  # times the row's distance from the reflector
+    if name.startswith("environment."):
+        return decay(config.lr_environment, config.lr_environment * config.lr_final_share)
     if kind == "positions":
         return 0.0 if warm_up else extent * decay(config.lr_position, config.lr_position_final)
     if kind == "normals" and warm_up:

@@ -41,7 +41,7 @@ _STEPS, _LEAST_STEPS = 250, 50
 """Steps of a trial; with less than `_PATIENT` minutes fewer in proportion: trials take about a third of them."""
 _FINALISTS = (4, 2)
 """Rungs at most that go on for twice as many steps, then again: a mirror's lead over a static cloud grows with them."""
-_CLOSE = 0.6
+_CLOSE = 1.0
 """dB below the rule's pick at most, for a rung to go on with it."""
 _SIZE, _PATCH = 200, 100
 """Longer side of the images, and of the patches, in trials."""
