@@ -5,20 +5,21 @@ cameras of the warp, so their eyes can be brought together: with both at one pla
 on the mirror, and its disparity is that of the surface.
 """
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import torch
 
-from catacaustics.cameras import Camera, pixel_centers
+from catacaustics.cameras import Camera
 from catacaustics.config import StereoConfig
 from catacaustics.errors import UserError
 from catacaustics.files import write_json
 from catacaustics.images import write_image
 from catacaustics.reflectors.warps import PlaneWarp, mirror_of
 from catacaustics.run import named_view, open_run, scene_file
-from catacaustics.scene import RenderOutput, Scene
+from catacaustics.scene import ReflectionDisks, RenderOutput, Scene
 from catacaustics.shapes import Float
 from catacaustics.splatting import splat_points
 from catacaustics.video import camera_path, check_film, film_key, frame_count, write_film
@@ -110,71 +111,92 @@ def reflection_disparity(scene: Scene, camera: Camera, rig: Rig) -> Disparity:
     Raises:
         UserError: no reflection is seen.
     """
-    left, right = rig.eyes(camera)
-    follows = rig.warp_cameras(camera)
-    weight = scene.render(left, warp_camera=follows[0]).reflection_weight.cpu().numpy()
-    values = []
-    with torch.no_grad():
-        for i, volume in enumerate(scene.volumes):
-            one = scene.reflection_disks(i, left, warp_camera=follows[0])
-            other = scene.reflection_disks(i, right, warp_camera=follows[1])
-            places = one.positions.new_full((len(scene.reflections[i].positions), 3), torch.nan)
-            places[other.rows] = other.positions
-            moved = places[one.rows]
-            both = torch.isfinite(moved).all(1)
-            shifts = _pixels(right, moved) - _pixels(left, one.positions)
-            features = torch.cat([torch.where(both[:, None], shifts, 0), both[:, None].to(shifts)], 1)
-            output = splat_points(*one[1:5], features, left, config=scene.splatting)
-            image = output.image.cpu().numpy()
-            shown = (weight > _LEAST_WEIGHT) & volume.project_mask(left) & (image[..., 2] > _LEAST_WEIGHT)
-            values.append(image[shown][:, :2] / image[shown][:, 2:])
-    return _summary(np.concatenate(values) if values else np.zeros((0, 2)))
+    right, follows = rig.eyes(camera)[1], rig.warp_cameras(camera)[1]
+
+    def displayed(index: int, disks: ReflectionDisks) -> Float[np.ndarray, "n 3"]:
+        other = scene.reflection_disks(index, right, warp_camera=follows)
+        places = disks.positions.new_full((len(scene.reflections[index].positions), 3), torch.nan)
+        places[other.rows] = other.positions
+        return _float64(places[disks.rows])
+
+    return _disparity(scene, camera, rig, displayed)
 
 
 def surface_disparity(scene: Scene, camera: Camera, rig: Rig) -> Disparity:
-    """Disparity of the reflectors' surfaces over the same pixels as `reflection_disparity`."""
+    """Disparity of the reflectors' surfaces where the left eye sees what they show: at the same disks, blended over the
+    same pixels as `reflection_disparity`, so that a picture on the surface has just this disparity.
+
+    Raises:
+        UserError: no reflection is seen.
+    """
+    left = rig.eyes(camera)[0]
+
+    def on_the_surface(index: int, disks: ReflectionDisks) -> Float[np.ndarray, "n 3"]:
+        pixels = left.project(_float64(disks.positions))[0]
+        return left.unproject(pixels, surface_depth(scene, index, left, pixels))
+
+    return _disparity(scene, camera, rig, on_the_surface)
+
+
+def _disparity(
+    scene: Scene,
+    camera: Camera,
+    rig: Rig,
+    seen: Callable[[int, ReflectionDisks], Float[np.ndarray, "n 3"]],
+) -> Disparity:
+    """Disparity per pixel of all reflectors, blended over the left eye's disks.
+
+    Args:
+        seen: a reflector's index and its disks in the left eye to the world points that the right eye sees, nan where
+            it sees none.
+    """
     left, right = rig.eyes(camera)
-    weight = scene.render(left, warp_camera=rig.warp_cameras(camera)[0]).reflection_weight.cpu().numpy()
-    values = []
-    for i in range(len(scene.volumes)):
-        depth = surface_depth(scene, i, left)
-        shown = (weight > _LEAST_WEIGHT) & np.isfinite(depth)
-        pixels = pixel_centers(left.viewport)[shown]
-        values.append(right.project(left.unproject(pixels, depth[shown]))[0] - pixels)
-    return _summary(np.concatenate(values) if values else np.zeros((0, 2)))
+    follows = rig.warp_cameras(camera)[0]
+    weight = scene.render(left, warp_camera=follows).reflection_weight.cpu().numpy()
+    values = [np.zeros((0, 2))]
+    with torch.no_grad():
+        for i, volume in enumerate(scene.volumes):
+            disks = scene.reflection_disks(i, left, warp_camera=follows)
+            shifts = right.project(seen(i, disks))[0] - left.project(_float64(disks.positions))[0]
+            both = np.isfinite(shifts).all(1, keepdims=True)
+            features = torch.from_numpy(np.c_[np.where(both, shifts, 0), both]).to(disks.positions)
+            output = splat_points(*disks[1:5], features, left, config=scene.splatting)
+            image = output.image.cpu().numpy()
+            shown = (weight > _LEAST_WEIGHT) & volume.project_mask(left) & (image[..., 2] > _LEAST_WEIGHT)
+            values.append(image[shown][:, :2] / image[shown][:, 2:])
+    return _summary(np.concatenate(values))
 
 
-def surface_depth(scene: Scene, index: int, camera: Camera) -> Float[np.ndarray, "height width"]:
-    """Depth of a reflector's surface at pixel centres, nan beside it: of its fitted mirror within its volume, or of the
-    volume where the rung has no mirror."""
+def surface_depth(
+    scene: Scene, index: int, camera: Camera, pixels: Float[np.ndarray, "*n 2"]
+) -> Float[np.ndarray, "*n"]:
+    """Depth of a reflector's surface at pixel coordinates, nan beside it: of its fitted mirror, or of its volume where
+    the rung has no mirror."""
     volume, mirror = scene.volumes[index], mirror_of(scene.warps[index])
-    rays = camera.ray_directions(pixel_centers(camera.viewport))
-    start = camera.center
+    rays, start = camera.ray_directions(pixels), camera.center
     if mirror is None:
         normals, limits = volume.halfspaces[:, :3], volume.halfspaces[:, 3]
         with np.errstate(divide="ignore", invalid="ignore"):
             cuts = -(normals @ start + limits) / (rays @ normals.T)
         entering = rays @ normals.T < 0
-        first = np.where(entering, cuts, -np.inf).max(-1)
-        last = np.where(entering, np.inf, cuts).min(-1)
-        return np.where((first > 0) & (first <= last), first, np.nan)
-    with torch.no_grad():
-        if isinstance(mirror, PlaneWarp):
-            normal, distance = (t.cpu().numpy().astype(np.float64) for t in mirror.plane())
-            with np.errstate(divide="ignore"):
-                depth = (distance - normal @ start) / (rays @ normal)
-        else:
-            center, axes = (t.cpu().numpy().astype(np.float64) for t in mirror.shape())
-            inverse = np.linalg.inv(axes)
-            u, v = rays @ inverse.T, inverse @ (start - center)
-            a, b, c = (u * u).sum(-1), u @ v, v @ v - 1
-            root = np.sqrt(np.where(b * b >= a * c, b * b - a * c, np.nan))
-            depth = (-b + root if bool(mirror.concave) else -b - root) / a
-    return np.where((depth > 0) & volume.project_mask(camera), depth, np.nan)
+        depth = np.where(entering, cuts, -np.inf).max(-1)
+        depth = np.where(depth <= np.where(entering, np.inf, cuts).min(-1), depth, np.nan)
+    elif isinstance(mirror, PlaneWarp):
+        normal, distance = (_float64(t) for t in mirror.plane())
+        with np.errstate(divide="ignore"):
+            depth = (distance - normal @ start) / (rays @ normal)
+    else:
+        center, axes = (_float64(t) for t in mirror.shape())
+        inverse = np.linalg.inv(axes)
+        u, v = rays @ inverse.T, inverse @ (start - center)
+        a, b, c = (u * u).sum(-1), u @ v, v @ v - 1
+        root = np.sqrt(np.where(b * b >= a * c, b * b - a * c, np.nan))
+        depth = (-b + root if bool(mirror.concave) else -b - root) / a
+    return np.where(depth > 0, depth, np.nan)
 
 
-def _pixels(camera: Camera, points: torch.Tensor) -> torch.Tensor:
-    return torch.from_numpy(camera.project(points.cpu().numpy().astype(np.float64))[0]).to(points)
+def _float64(tensor: torch.Tensor) -> np.ndarray:
+    return tensor.detach().cpu().numpy().astype(np.float64)
 
 
 def _summary(values: np.ndarray) -> Disparity:
@@ -237,7 +259,7 @@ def _measured(scene: Scene, camera: Camera, rig: Rig) -> dict[str, Disparity]:
         return {
             "full": reflection_disparity(scene, camera, full),
             "chosen": reflection_disparity(scene, camera, rig),
-            "surface": surface_disparity(scene, camera, full),
+            "surface": surface_disparity(scene, camera, rig),
         }
     except UserError:
         return {}

@@ -108,7 +108,7 @@ def main(check: Check) -> None:
     for camera in cameras:
         rig = usual_rig(scene, camera)
         high = [reflection_disparity(scene, camera, rig._replace(warp=w)).high for w in _SEPARATIONS]
-        surface = surface_disparity(scene, camera, rig).high
+        surface = surface_disparity(scene, camera, rig._replace(warp=0.0)).high
         numbers["stereo"].append({"reflections": high, "surface": surface, "monotone": bool((np.diff(high) < 0).all())})
         print(f"stereo, 95 % of disparity: {', '.join(f'{d:.2f}' for d in high)} px; surface {surface:.2f} px")
     if check.truth is not None:

@@ -63,7 +63,7 @@ def main(settings: Pair) -> None:
         f"{share:g}": reflection_disparity(run.scene, camera, rig._replace(warp=share))
         for share in settings.warp_separations
     }
-    measured["surface"] = surface_disparity(run.scene, camera, rig)
+    measured["surface"] = surface_disparity(run.scene, camera, rig._replace(warp=0.0))
     print(f"eyes {rig.separation:.4g} apart, screen at {rig.screen:.4g}, disparity in pixels at {camera.width} wide")
     print(f"{'warp separation':<16}{'5 %':>8}{'median':>8}{'95 %':>8}{'vertical 95 %':>15}")
     for name, d in measured.items():
