@@ -349,8 +349,19 @@ def _protocol(protocol: dict[str, Any]) -> str:
 
 def definitions_html(values: dict[str, Any]) -> str:
     """Names and values as a list."""
-    rows = "".join(f"<dt>{escape(str(k))}</dt><dd>{escape(str(v))}</dd>" for k, v in values.items())
+    rows = "".join(f"<dt>{escape(str(k))}</dt><dd>{escape(_plain(v))}</dd>" for k, v in values.items())
     return f"<dl>{rows}</dl>"
+
+
+def _plain(value: Any) -> str:
+    """A setting as people write it."""
+    if value is None:
+        return "not set"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return ", ".join(map(_plain, value)) if isinstance(value, list) else str(value)
 
 
 def details_html(title: str, body: str, opened: bool = False) -> str:

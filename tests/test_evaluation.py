@@ -16,6 +16,7 @@ from catacaustics.config import EvaluateConfig, TrainConfig
 from catacaustics.errors import UserError
 from catacaustics.evaluation import evaluate, format_table, reflector_mask
 from catacaustics.reflectors.volume import build_volume
+from catacaustics.report import definitions_html
 from catacaustics.run import open_run, read_log
 from catacaustics.scene import Scene
 from catacaustics.training.initialize import Reflector, initial_scene, primary_seeds, reflection_seeds, start_warps
@@ -183,6 +184,12 @@ def test_a_report_of_few_views_shows_an_even_spread_and_lists_all(capture, run, 
     text = (run / "report.html").read_text()
     assert re.findall(r"<h3>([^<]*)</h3>", text) == [many.held_out[i].name for i in (0, 3, 6)]
     assert len(re.findall(r'<tr><th scope="row">view_\d+\.png</th>', text)) == 7
+
+
+def test_settings_are_listed_as_people_write_them():
+    settings = {"minutes": 3.1921017394334434, "model": ["sphere", "plane"], "view": False, "points": None, "seed": 0}
+    written = re.findall("<dd>(.*?)</dd>", definitions_html(settings | {"rate": 1.6e-05}))
+    assert written == ["3.1921", "sphere, plane", "no", "not set", "0", "1.6e-05"]
 
 
 def test_names_in_the_report_are_escaped(capture, tmp_path, monkeypatch):

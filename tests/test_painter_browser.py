@@ -389,6 +389,14 @@ def test_one_finger_paints_and_two_zoom(root, chromium):
     assert not painter.errors
 
 
+def test_on_a_phone_held_upright_every_tool_is_in_sight(painter):
+    painter.page.set_viewport_size({"width": 390, "height": 844})
+    hidden = "[...document.querySelectorAll('.tools button')].filter((e) => e.getBoundingClientRect().bottom > "
+    hidden += "e.parentElement.getBoundingClientRect().bottom).map((e) => e.title)"
+    assert painter.ask(hidden) == []
+    assert painter.ask("document.documentElement.scrollWidth <= innerWidth")
+
+
 # When things go wrong ------------------------------------------------------------------------------------------------
 
 
