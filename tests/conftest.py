@@ -9,8 +9,10 @@ from jaxtyping import install_import_hook
 install_import_hook("catacaustics", "beartype.beartype")
 
 import splatter  # noqa: E402
+from toy import make_toy_capture  # noqa: E402
 
 from catacaustics import splatting  # noqa: E402
+from catacaustics.capture.dataset import open_capture  # noqa: E402
 from catacaustics.splatting import library  # noqa: E402
 
 
@@ -31,6 +33,12 @@ def pytest_terminal_summary(terminalreporter):
     for (backend, dtype), seen in sorted(splatter.errors.items()):
         figures = "  ".join(f"{name} {error:.0e}" for name, error in seen.items())
         terminalreporter.write_line(f"{backend} {dtype}: {figures}")
+
+
+@pytest.fixture(scope="module")
+def capture(tmp_path_factory):
+    """The toy capture, with masks and points."""
+    return open_capture(make_toy_capture(tmp_path_factory.mktemp("capture")))
 
 
 @pytest.fixture(params=splatter.BACKENDS)

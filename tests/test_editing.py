@@ -6,10 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from toy import BALL_CENTER, make_toy_capture, scene_of, write_run
+from toy import BALL_CENTER, scene_of, write_run
 
 from catacaustics import cli
-from catacaustics.capture.dataset import open_capture
 from catacaustics.editing import (
     adjust_reflections,
     clone_reflector,
@@ -21,11 +20,6 @@ from catacaustics.errors import UserError
 from catacaustics.geometry import sphere_directions
 from catacaustics.reflectors.warps import PlaneWarp, QuadricWarp
 from catacaustics.scene import Scene
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    return open_capture(make_toy_capture(tmp_path_factory.mktemp("editing")))
 
 
 @pytest.fixture(scope="module")

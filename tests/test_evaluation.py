@@ -8,10 +8,9 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 from stand_in import StandInScene, make_run
-from toy import ball_mask, make_toy_capture
+from toy import ball_mask
 
 from catacaustics import evaluation
-from catacaustics.capture.dataset import open_capture
 from catacaustics.config import EvaluateConfig, TrainConfig
 from catacaustics.errors import UserError
 from catacaustics.evaluation import evaluate, format_table, reflector_mask
@@ -20,11 +19,6 @@ from catacaustics.report import definitions_html
 from catacaustics.run import open_run, read_log
 from catacaustics.scene import Scene
 from catacaustics.training.initialize import Reflector, initial_scene, primary_seeds, reflection_seeds, start_warps
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    return open_capture(make_toy_capture(tmp_path_factory.mktemp("capture")))
 
 
 @pytest.fixture(scope="module")

@@ -5,22 +5,16 @@ import struct
 import numpy as np
 import pytest
 import torch
-from toy import BALL_CENTER, BALL_RADIUS, make_toy_capture, scene_of, write_run
+from toy import BALL_CENTER, BALL_RADIUS, scene_of, write_run
 
 from catacaustics import cli
 from catacaustics.capture.colmap import read_model
-from catacaustics.capture.dataset import open_capture
 from catacaustics.capture.importers import import_capture
 from catacaustics.editing import clone_reflector
 from catacaustics.export import mirror_mesh, point_colors, sphere_mesh, write_gaussians
 from catacaustics.points import read_ply
 from catacaustics.reflectors.warps import PlaneWarp, QuadricWarp, mirror_of
 from catacaustics.splatting import splat_points
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    return open_capture(make_toy_capture(tmp_path_factory.mktemp("export")))
 
 
 @pytest.fixture(scope="module")

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 import torch
-from toy import BALL_CENTER, ball_mask, make_toy_capture, toy_cameras
+from toy import BALL_CENTER, ball_mask, toy_cameras
 
 from catacaustics.cameras import Viewport
-from catacaustics.capture.dataset import open_capture
 from catacaustics.config import TrainConfig
 from catacaustics.errors import UserError
 from catacaustics.reflectors.volume import build_volume
@@ -19,11 +18,6 @@ from catacaustics.training.initialize import (
     start_warps,
 )
 from catacaustics.training.selection import LADDER
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    return open_capture(make_toy_capture(tmp_path_factory.mktemp("toy")))
 
 
 def build(capture, **options):

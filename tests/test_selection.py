@@ -99,25 +99,36 @@ def test_a_capture_without_masks_trains_the_primary_cloud_alone(tmp_path, capsys
     assert len(scene.reflections) == 0
 
 
-def test_a_short_training_does_not_try_networks_and_says_so(tmp_path, monkeypatch, capsys):
+@pytest.fixture
+def choose(tmp_path, monkeypatch):
+    """Chooses models for the toy by trials that score as a function of name and rounds tells, without training.
+    Returns the configuration chosen, and the trials as (name, rounds)."""
     capture = open_capture(make_toy_capture(tmp_path / "capture"))
-    tried = []
 
-    def run(trials, name, question, settings, rounds=1):
-        tried.append(name)
-        score = 30.0 if name == "sphere" else 20.0
-        trials.done.append(Trial(name, question, settings, rounds, 1.0, 80, 100, 10, [[score, score]], [score, score]))
-        return trials.done[-1]
+    def choose(score, **settings):
+        tried = []
 
-    monkeypatch.setattr(selection._Trials, "run", run)
-    config = TrainConfig(capture.root, tmp_path / "run", minutes=4.0)
-    config.run.mkdir()
-    chosen = choose_models(capture, [build_volume(capture, name) for name in capture.reflectors], config)
+        def run(trials, name, question, changes, rounds=1):
+            tried.append((name, rounds))
+            scores = [score(name, rounds)] * 2
+            trials.done.append(Trial(name, question, changes, rounds, 1.0, 80, 100, 10, [scores], scores))
+            return trials.done[-1]
+
+        monkeypatch.setattr(selection._Trials, "run", run)
+        config = TrainConfig(capture.root, tmp_path / "run", minutes=4.0, **settings)
+        config.run.mkdir()
+        return choose_models(capture, [build_volume(capture, name) for name in capture.reflectors], config), tried
+
+    return choose
+
+
+def test_a_short_training_does_not_try_networks_and_says_so(choose, capsys):
+    chosen, tried = choose(lambda name, _: 30.0 if name == "sphere" else 20.0)
     assert chosen.model == ("sphere",)
-    assert "plane" in tried
-    assert not {"neural", "quadric+neural"} & set(tried)
+    assert ("plane", 1) in tried
+    assert not {"neural", "quadric+neural"} & {name for name, _ in tried}
     assert "neural and quadric+neural are not tried" in capsys.readouterr().out
-    assert "Not tried" in (config.run / "model_choice.html").read_text()
+    assert "Not tried" in (chosen.run / "model_choice.html").read_text()
 
 
 @pytest.mark.parametrize(("minutes", "steps"), [(2.0, 50), (15.0, 125), (30.0, 250), (None, 250)])
@@ -127,20 +138,10 @@ def test_trials_are_as_long_as_the_training_can_afford(tmp_path, minutes, steps)
     assert selection._Trials(capture, [], config).config.iterations == steps
 
 
-def test_a_lead_that_only_a_longer_trial_shows_decides(tmp_path, monkeypatch, capsys):
-    capture = open_capture(make_toy_capture(tmp_path / "capture"))
-    tried = []
-
-    def run(trials, name, question, settings, rounds=1):
-        tried.append((name, rounds))
-        score = {"none": 20.0, "concave": 20.1 + 0.2 * (rounds - 1)}.get(name, 18.0)
-        trials.done.append(Trial(name, question, settings, rounds, 1.0, 80, 100, 10, [[score, score]], [score, score]))
-        return trials.done[-1]
-
-    monkeypatch.setattr(selection._Trials, "run", run)
-    config = TrainConfig(capture.root, tmp_path / "run", minutes=4.0, environment_width=0)
-    config.run.mkdir()
-    chosen = choose_models(capture, [build_volume(capture, name) for name in capture.reflectors], config)
+def test_a_lead_that_only_a_longer_trial_shows_decides(choose):
+    chosen, tried = choose(
+        lambda name, rounds: {"none": 20.0, "concave": 20.1 + 0.2 * (rounds - 1)}.get(name, 18.0), environment_width=0
+    )
     assert chosen.model == ("concave",)
     assert [t for t in tried if t[1] > 1] == [("none", 2), ("concave", 2), ("none", 4), ("concave", 4)]
 

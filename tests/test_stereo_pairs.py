@@ -6,11 +6,10 @@ import json
 import numpy as np
 import pytest
 import torch
-from toy import BALL_CENTER, BALL_RADIUS, ball_mask, make_toy_capture, scene_of, write_run
+from toy import BALL_CENTER, BALL_RADIUS, ball_mask, scene_of, write_run
 
 from catacaustics import cli
 from catacaustics.cameras import pixel_centers
-from catacaustics.capture.dataset import open_capture
 from catacaustics.images import read_image
 from catacaustics.reflectors.warps import PlaneWarp, QuadricWarp
 from catacaustics.stereo import (
@@ -23,11 +22,6 @@ from catacaustics.stereo import (
     surface_disparity,
     usual_rig,
 )
-
-
-@pytest.fixture(scope="module")
-def capture(tmp_path_factory):
-    return open_capture(make_toy_capture(tmp_path_factory.mktemp("stereo")))
 
 
 @pytest.fixture(scope="module")
