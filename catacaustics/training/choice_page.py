@@ -53,9 +53,11 @@ def choice_html(folder: Path, result: dict[str, Any], least_gain: float) -> str:
             sections.append(f"<section><h2>{heading}</h2>{_table(rows, question, i, measure, taken)}</section>")
     bars = (
         ".bars td, .bars th { padding: .35rem 1rem; text-align: right; } .bars th:first-child { text-align: left; }"
-        ".bars td.track { width: 22rem; text-align: left; } .bars tbody tr { border-top: 1px solid var(--line); }"
+        ".bars .track { width: 22rem; text-align: left; } .bars tbody tr { border-top: 1px solid var(--line); }"
         ".track i { display: block; height: .8rem; border-radius: 3px; background: var(--accent); opacity: .55; }"
         ".taken { font-weight: 600; } .taken .track i { opacity: 1; }"
+        ".bars td, .bars th[scope=row] { white-space: nowrap; }"
+        "@media (max-width: 800px) { .bars td, .bars th { padding-inline: .4rem; } .bars .track { display: none; } }"
     )
     header = (
         f'<header><p class="facts">Model choice</p><h1>{name}</h1><p>{models}{"; " + rest if rest else ""}</p>'
@@ -69,7 +71,7 @@ def _table(rows: Sequence[dict[str, Any]], question: str, reflector: int, measur
     low, high = min(scores), max(scores)
     body = []
     for trial, score in zip(rows, scores, strict=True):
-        width = 8 + 92 * (score - low) / max(high - low, 1.0)
+        width = 100 * (score - low) / max(high - low, 1.0)
         cells = (
             f'<td>{score:.2f} dB</td><td class="track"><i style="width:{width:.1f}%"></i></td>'
             f"<td>{trial['seconds']:.1f}</td><td>{trial['steps']}</td><td>{trial['points']:,}</td>"
@@ -81,8 +83,8 @@ def _table(rows: Sequence[dict[str, Any]], question: str, reflector: int, measur
         note = (", finalist" if trial["rounds"] > 1 else "") + (" (taken)" if is_taken else "")
         body.append(f'<tr{mark}><th scope="row">{escape(trial["name"])}{note}</th>{cells}</tr>')
     head = (
-        f"<tr><th>candidate</th><th>{measure}</th><th></th><th>seconds</th><th>steps</th><th>points</th>"
-        "<th>network parameters</th></tr>"
+        f'<tr><th>candidate</th><th>{measure}</th><th class="track">above the lowest</th><th>seconds</th>'
+        "<th>steps</th><th>points</th><th>network parameters</th></tr>"
     )
     return f'<div class="scroll"><table class="bars"><thead>{head}</thead><tbody>{"".join(body)}</tbody></table></div>'
 
