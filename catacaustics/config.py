@@ -464,8 +464,8 @@ class RefractDataConfig:
 
 
 RefractModel = Literal["glassnet", "crystalnet", "ssnrb", "direct", "hybrid"]
-"""Renderers: without R-buffer; with texture, world or screen coordinates from their generator; with both of the
-first two."""
+"""Renderers: without R-buffer; with texture, world or screen coordinates from their generator; with world coordinates
+looked up on the screen and by a probe."""
 
 
 @dataclass(frozen=True)
@@ -482,7 +482,7 @@ class RefractTrainConfig:
     """Folder to write: generator and renderer, checkpoints, metrics.jsonl."""
     model: RefractModel = "hybrid"
     """glassnet has no R-buffer, crystalnet looks colours up by texture coordinates, ssnrb on the screen by world
-    coordinates, direct by screen coordinates (ablation), hybrid by world or texture coordinates, pixel by pixel."""
+    coordinates, direct by screen coordinates (ablation), hybrid by world coordinates on the screen or by a probe."""
     part: Literal["both", "generator", "renderer"] = "both"
     """Train only one; the renderer needs a trained generator in the run or in --generator."""
     generator: Path | None = None
@@ -499,8 +499,9 @@ class RefractTrainConfig:
     """Optimiser steps of each part, at most."""
     clock: Literal["wall", "cpu"] = "wall"
     """What minutes are measured by; cpu: processor time of this process, fair where others use the machine too."""
-    batch: int = 2
-    crop: int = 64
+    batch: int = 8
+    """Crops of a step. Many small ones tell more than few large ones: each comes from another frame."""
+    crop: int = 32
     """Side of the square training crops in pixels; 0 takes whole images."""
     glass_share: float = 0.8
     """Share of the crops centred on a refractive pixel; the others are anywhere."""

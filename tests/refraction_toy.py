@@ -11,7 +11,7 @@ from scipy.ndimage import map_coordinates
 
 from catacaustics.files import write_json
 from catacaustics.images import resize, write_image
-from catacaustics.refraction.frames import Frame, write_shard
+from catacaustics.refraction.frames import FORMAT, Frame, write_shard
 
 HALF = 0.9
 _WALLS = [(0, -1), (0, 1), (1, -1), (1, 1), (2, -1)]
@@ -88,6 +88,17 @@ def view(eye, side, spread=0.42):
     return clip @ world_to_camera, rays / np.linalg.norm(rays, axis=-1, keepdims=True)
 
 
+def toy_probe(center, rows, textures):
+    """What is seen all around a point, as `Frame.probe`; black where the room is open."""
+    polar, azimuth = np.meshgrid(
+        (np.arange(rows) + 0.5) / rows * np.pi, ((np.arange(2 * rows) + 0.5) / rows - 1) * np.pi, indexing="ij"
+    )
+    around = np.sin(polar)[..., None] * np.stack([np.cos(azimuth), np.sin(azimuth), 0 * polar], -1)
+    around[..., 2] = np.cos(polar)
+    _, _, wall, uv = hit_walls(np.broadcast_to(center, around.shape), around)
+    return (texture_color(textures, wall, uv) * 255).round().astype(np.uint8)
+
+
 def toy_frame(rng, side=32, screen=64, balls=2, reference=True, textures=None, placed=None):
     """A frame with balls at random places, or at those of `placed` (n, 3)."""
     textures = textures or toy_textures()
@@ -132,6 +143,7 @@ def toy_frame(rng, side=32, screen=64, balls=2, reference=True, textures=None, p
     image = np.where(refractive[..., None], 0.9 * seen + 0.05, direct) if reference else np.zeros_like(direct)
     _, big = view(eye, screen if reference else 0)
     s_position, _, s_wall, s_uv = hit_walls(np.broadcast_to(eye, big.shape), big)
+    probe_position = centers.mean(0) if k else np.zeros(3)
     f = np.float32
     return Frame(
         reference=np.clip(image, 0, 1).astype(f),
@@ -155,6 +167,8 @@ def toy_frame(rng, side=32, screen=64, balls=2, reference=True, textures=None, p
         internal_reflection=mirrored & refractive,
         screen=(texture_color(textures, s_wall, s_uv) * 255).round().astype(np.uint8),
         screen_depth=(eye[2] - s_position[..., 2]).astype(f),
+        probe=toy_probe(probe_position, screen // 2 if reference else 0, textures),
+        probe_position=probe_position.astype(f),
         world_to_clip=world_to_clip.astype(f),
         camera_position=eye.astype(f),
         parameters=(light + 0.5).astype(f),
@@ -178,6 +192,13 @@ def make_toy_frames(folder, side=32, screen=64, seed=0, balls=2, textures=None, 
     for name, image in zip(names, textures, strict=True):
         write_image(Path(folder) / name, image)
     parameters = [{"name": f"light_{axis}", "low": -0.5, "high": 0.5} for axis in "xyz"]
-    card = {"scene": "toy", "resolution": side, "textures": names, "shards": shards, "parameters": parameters}
+    card = {
+        "format": FORMAT,
+        "scene": "toy",
+        "resolution": side,
+        "textures": names,
+        "shards": shards,
+        "parameters": parameters,
+    }
     write_json(Path(folder) / "card.json", card)
     return Path(folder)

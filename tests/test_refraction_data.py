@@ -15,7 +15,8 @@ import pytest
 from catacaustics import cli
 from catacaustics.config import RefractDataConfig
 from catacaustics.errors import UserError
-from catacaustics.files import read_json
+from catacaustics.files import read_json, write_json
+from catacaustics.geometry import normalize
 from catacaustics.refraction import data, stage
 from catacaustics.refraction.contact import true_colour
 from catacaustics.refraction.data import make_data, make_frame
@@ -133,6 +134,21 @@ def test_a_landing_point_that_is_seen_directly_has_the_screens_colour_and_depth(
     assert np.median(np.abs(looked_up - on_screen)) < 0.02
 
 
+def test_the_probe_shows_off_screen_landing_points_as_their_textures_are(checker):
+    towards = normalize(checker.landing - checker.probe_position)
+    row = np.arccos(towards[..., 2]) / np.pi * 128
+    column = (np.arctan2(towards[..., 1], towards[..., 0]) / np.pi + 1) * 128
+    found = checker.probe[np.minimum(row.astype(int), 127), np.minimum(column.astype(int), 255)] / 255
+    textures = [body.texture() for body in find_scene("checker").opaque]
+    p = np.concatenate([checker.landing, np.ones((64, 64, 1))], -1) @ checker.world_to_clip.T
+    off = (checker.landing_object >= 0) & (np.abs(p[..., :2]) > p[..., 3:]).any(-1)
+    miss = np.abs(true_colour(checker, textures) - found).mean(-1)[off]
+    other = np.abs(true_colour(checker, textures) - np.roll(found, 20, 1)).mean(-1)[off]
+    assert off.sum() > 100
+    assert np.median(miss) < 0.05
+    assert np.median(miss) < 0.3 * np.median(other)
+
+
 def test_hemisphere_lands_much_off_screen_and_tir_reflects_much_inside():
     frames = [make_frame(find_scene("hemisphere"), TINY, "generator", i) for i in range(4)]
     outside = []
@@ -151,7 +167,7 @@ def test_hemisphere_lands_much_off_screen_and_tir_reflects_much_inside():
 def test_a_shard_gives_back_what_was_written_within_the_stated_rounding(checker, tmp_path):
     write_shard(tmp_path / "shard.npz", [checker, checker])
     again = read_frame(tmp_path / "shard.npz", 1)
-    exact = ("landing", "landing_uv", "landing_object", "refractive", "events", "world_to_clip", "screen", "parameters")
+    exact = ("landing", "landing_uv", "landing_object", "refractive", "events", "world_to_clip", "screen", "probe")
     for name in exact:
         np.testing.assert_array_equal(getattr(again, name), getattr(checker, name), err_msg=name)
     for name in ("position", "normal", "object_position", "object_normal", "landing_normal"):
@@ -180,6 +196,16 @@ def test_a_data_set_opens_with_its_card_textures_and_splits(tiny):
     assert (tiny / "contact.jpg").stat().st_size > 5000
     with pytest.raises(UserError, match="no split"):
         frames.split("trian")
+
+
+def test_a_data_set_of_an_older_format_is_neither_read_nor_continued(tiny, tmp_path):
+    folder = copied(tiny, tmp_path)
+    card = read_json(folder / "card.json")
+    del card["format"]
+    write_json(folder / "card.json", card)
+    for use in (open_frames, lambda out: make_data(replace(TINY, out=out))):
+        with pytest.raises(UserError, match=r"(?s)format 1.*format 2.*empty folder"):
+            use(folder)
 
 
 def test_no_frame_of_one_split_is_drawn_as_one_of_another(tiny):

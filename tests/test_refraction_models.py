@@ -16,7 +16,14 @@ from catacaustics.refraction import models as m
 from catacaustics.refraction import train as training
 from catacaustics.refraction.buffers import BufferCache, frame_buffers, frame_screen, stack
 from catacaustics.refraction.frames import open_frames, write_shard
-from catacaustics.refraction.lookup import Textures, inside_screen, project, sample_screen, snap, visibility
+from catacaustics.refraction.lookup import (
+    Textures,
+    inside_screen,
+    project,
+    sample_probe,
+    sample_screen,
+    visibility,
+)
 from catacaustics.refraction.measures import landing_regions
 from catacaustics.refraction.networks import SIZES, ObjectEncoder, exit_guesses, refract
 
@@ -40,16 +47,6 @@ def trained(data, tmp_path_factory):
     """A hybrid of a few steps: folder and model."""
     run = tmp_path_factory.mktemp("run") / "hybrid"
     return run, training.train(RefractTrainConfig(data, run, "hybrid", **SMALL))
-
-
-def test_texture_coordinates_are_learned_from_true_landing_points_and_follow_the_predicted_ones(smooth_frame):
-    buffers = frame_buffers(smooth_frame[0])
-    moved = buffers._replace(landing=buffers.landing + 0.3)
-    generator = fresh_model("hybrid").generator
-    with torch.no_grad():
-        uv = [m.split_output("hybrid", generator.train(mode)(b)).uv for mode in (True, False) for b in (buffers, moved)]
-    assert not torch.equal(uv[0], uv[1])
-    assert torch.equal(uv[2], uv[3])
 
 
 def fresh_model(name, textures=5, size="small"):
@@ -100,23 +97,6 @@ def test_a_point_behind_another_is_not_visible_and_one_on_it_is(smooth_frame):
     assert visibility(screen.depth, ndc, depth + 0.075, 0.05)[inner].mean() == pytest.approx(0.5, abs=0.05)
 
 
-def test_points_snap_along_their_ray_to_what_the_camera_sees_and_stay_where_that_is_far(smooth_frame):
-    frame, _ = smooth_frame
-    buffers, screen = frame_buffers(frame), frame_screen(frame)
-    seen = torch.from_numpy(landing_regions(frame)["seen"])
-    start = buffers.objects[:, :, 1:4].sum(1)  # the toy's balls stand apart
-    alone = seen & (buffers.objects[0, :, 0].sum(0) == 1)
-    ray = torch.nn.functional.normalize(buffers.landing - start, dim=1)
-    for error in (-0.1, 0.15):
-        snapped = snap(buffers.landing + error * ray, start, buffers.world_to_clip, screen.depth, 0.3)
-        miss = (snapped - buffers.landing).norm(dim=1)[0][alone]
-        assert miss.median() < 0.005
-        assert miss.mean() < 0.03
-    far = buffers.landing - 0.5 * ray
-    stayed = (snap(far, start, buffers.world_to_clip, screen.depth, 0.3) - far).norm(dim=1)[0][alone]
-    assert stayed.median() == 0
-
-
 def test_texture_lookup_is_bilinear_repeats_and_is_exact_at_texel_centres():
     image = np.random.default_rng(0).integers(0, 256, (5, 7, 3), dtype=np.uint8)
     textures = Textures([np.full((1, 1, 3), 51, np.uint8), image])
@@ -132,23 +112,43 @@ def test_texture_lookup_is_bilinear_repeats_and_is_exact_at_texel_centres():
     assert textures.sample(index - 2, uv).abs().max() == 0
 
 
-def test_hybrid_takes_the_screen_where_the_point_is_seen_and_the_texture_elsewhere():
-    """The textures are gray, the screen is white: the colour tells where it came from."""
-    gray = [np.full((4, 4, 3), 102, np.uint8)] * 5
+def test_the_probe_shows_every_landing_point_of_an_empty_room_also_where_its_panorama_begins(smooth_frame):
+    frame, images = smooth_frame
+    buffers, screen = frame_buffers(frame), frame_screen(frame)
+    found = sample_probe(screen.probe, screen.probe_position, buffers.landing)
+    right = Textures(images).sample(buffers.landing_object, buffers.landing_uv)
+    lands = buffers.landing_object >= 0
+    assert 255 * (found - right).abs().mean(1)[lands].mean() < 1
+    columns = torch.arange(8.0).expand(1, 1, 4, 8)
+    seam = torch.tensor([-1.0, 0.0, 0.0]).view(1, 3, 1, 1)
+    assert sample_probe(columns, torch.zeros(1, 3), seam).item() == pytest.approx(3.5)
+    up = torch.arange(4.0).view(1, 1, 4, 1).expand(1, 1, 4, 8)
+    assert sample_probe(up, torch.zeros(1, 3), torch.tensor([0.0, 0.0, 1.0]).view(1, 3, 1, 1)).item() == 0
+
+
+def test_hybrid_takes_the_screen_where_the_point_is_seen_and_the_probe_elsewhere():
+    """The panorama is gray, the screen is white: the colour tells where it came from."""
     frame = toy_frame(np.random.default_rng(2), 48, 128, placed=[(0.3, 0.3, 0.5), (-0.3, -0.1, 0.5)])
     buffers, screen = frame_buffers(frame), frame_screen(frame)
-    white = screen._replace(color=torch.ones_like(screen.color))
-    textures = Textures(gray)
-    perfect = m.truth("hybrid", buffers, 5)
-    color = m.landing_color("hybrid", perfect, buffers, white, textures)[0, 0].numpy()
+    screen = screen._replace(color=torch.ones_like(screen.color), probe=torch.full_like(screen.probe, 0.4))
+    perfect, textures = m.truth("hybrid", buffers, 5), Textures(toy_textures())
+    color = m.landing_color("hybrid", perfect, buffers, screen, textures)[0, 0].numpy()
     regions = landing_regions(frame)
     assert regions["off screen"].sum() > 10
     assert np.median(color[regions["seen"]]) == 1
     assert color[regions["off screen"]] == pytest.approx(0.4, abs=1e-5)
-    hidden = m.landing_color("hybrid", perfect, buffers, white._replace(depth=screen.depth - 0.5), textures)[
-        0, 0
-    ].numpy()
+    nearer = screen._replace(depth=screen.depth - 0.5)
+    hidden = m.landing_color("hybrid", perfect, buffers, nearer, textures)[0, 0].numpy()
     assert (np.abs(hidden[regions["seen"]] - 0.4) < 1e-5).mean() > 0.9
+
+
+def test_blurred_colours_are_the_means_of_cells_of_the_panorama(smooth_frame):
+    screen = frame_screen(smooth_frame[0])
+    rows = torch.arange(256) % 2  # of 256 rows every other one is white
+    screen = screen._replace(probe=rows.float()[:, None].expand(1, 3, 256, 512))
+    blurred = m.blurred_colors(torch.randn(1, 3, 5, 5), screen)
+    assert blurred.shape == (1, 3 * len(m.BLURRED_ROWS), 5, 5)
+    torch.testing.assert_close(blurred, torch.full_like(blurred, 0.5))
 
 
 @pytest.mark.parametrize("kind", ["uv", "world", "screen", "hybrid"])
@@ -316,6 +316,8 @@ def test_content_keeps_the_colour_or_the_normal_of_the_r_buffer():
     r_buffer = torch.rand(1, 6, 4, 4) + 0.1
     assert torch.equal(training.keep_content(r_buffer, "both"), r_buffer)
     assert training.keep_content(r_buffer, "color")[0].flatten(1).any(1).tolist() == [True] * 3 + [False] * 3
+    more = torch.rand(1, 12, 4, 4) + 0.1
+    assert training.keep_content(more, "color")[0].flatten(1).any(1).tolist() == [True] * 3 + [False] * 3 + [True] * 6
     assert training.keep_content(r_buffer, "normal")[0].flatten(1).any(1).tolist() == [False] * 3 + [True] * 3
 
 

@@ -92,7 +92,10 @@ def frame_buffers(frame: Frame) -> Buffers:
 def frame_screen(frame: Frame) -> Screen:
     """The screen-space buffers of one frame, b = 1."""
     color = torch.from_numpy(frame.screen).movedim(-1, 0)[None].float() / 255
-    return Screen(color, torch.from_numpy(frame.screen_depth)[None, None])
+    probe = torch.from_numpy(frame.probe).movedim(-1, 0)[None].float() / 255
+    return Screen(
+        color, torch.from_numpy(frame.screen_depth)[None, None], probe, torch.from_numpy(frame.probe_position)[None]
+    )
 
 
 def _rays(frame: Frame) -> Float[np.ndarray, "h w 3"]:

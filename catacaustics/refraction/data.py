@@ -18,11 +18,21 @@ from tqdm import tqdm
 from catacaustics.cameras import Camera
 from catacaustics.config import RefractDataConfig
 from catacaustics.errors import UserError
-from catacaustics.files import read_json, write_json
+from catacaustics.files import write_json
 from catacaustics.geometry import normalize
 from catacaustics.images import write_image
 from catacaustics.refraction.contact import contact_sheet
-from catacaustics.refraction.frames import CARD, SPLITS, Frame, open_frames, sha256_of, shard_problem, write_shard
+from catacaustics.refraction.frames import (
+    CARD,
+    FORMAT,
+    SPLITS,
+    Frame,
+    open_frames,
+    read_card,
+    sha256_of,
+    shard_problem,
+    write_shard,
+)
 from catacaustics.refraction.scenes import Scene, at_shares, draw, find_scene, ranges, with_ranges
 from catacaustics.refraction.stage import MAX_DEPTH, Stage, camera_of, camera_rays, srgb, whole_samples, world_to_clip
 from catacaustics.refraction.trace import MAX_EVENTS, land
@@ -81,6 +91,7 @@ def _render(stage: Stage, camera: Camera, share: np.ndarray, screen: int, spp: i
     """All buffers, with a reference where spp is above 0."""
     opaque = stage.gbuffer(camera)
     colour, depth = _screen(stage, camera, screen)
+    probe, probe_position = _probe(stage, screen // 2)
     black = np.zeros((camera.height, camera.width, 3))
     reference = srgb(stage.reference(camera, whole_samples(spp), noise)) if spp else black
     return Frame(
@@ -93,6 +104,8 @@ def _render(stage: Stage, camera: Camera, share: np.ndarray, screen: int, spp: i
         **_landing(stage, camera),
         screen=colour,
         screen_depth=depth,
+        probe=probe,
+        probe_position=probe_position,
         world_to_clip=world_to_clip(camera).astype(np.float32),
         camera_position=camera.center.astype(np.float32),
         parameters=share.astype(np.float32),
@@ -123,6 +136,11 @@ def _screen(stage: Stage, camera: Camera, side: int) -> tuple[np.ndarray, np.nda
         return np.zeros((0, 0, 3), np.uint8), np.zeros((0, 0), np.float32)
     found = stage.gbuffer(camera.resized(side, side))
     return np.round(255 * np.clip(found["albedo"], 0, 1)).astype(np.uint8), found["depth"]
+
+
+def _probe(stage: Stage, rows: int) -> tuple[np.ndarray, np.ndarray]:
+    """Panorama of the opaque scene and where it is taken."""
+    return stage.probe(rows) if rows else (np.zeros((0, 0, 3), np.uint8), np.zeros(3, np.float32))
 
 
 def _landing(stage: Stage, camera: Camera) -> dict[str, np.ndarray]:
@@ -171,7 +189,7 @@ def _start(config: RefractDataConfig, scene: Scene, variant: str) -> dict[str, A
     settings["ranges"] = list(config.ranges)
     path = config.out / CARD
     if path.is_file():
-        card = read_json(path)
+        card = read_card(config.out)
         before = card.get("settings", {})
         changed = [f"{k} {before.get(k)}" for k in settings if before.get(k) != settings[k]]
         if changed:
@@ -185,6 +203,7 @@ def _start(config: RefractDataConfig, scene: Scene, variant: str) -> dict[str, A
     for file, body in zip(textures, scene.opaque, strict=True):
         write_image(config.out / file, body.texture())
     card = {
+        "format": FORMAT,
         "scene": scene.name,
         "about": scene.about,
         "settings": settings,

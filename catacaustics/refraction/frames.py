@@ -27,6 +27,8 @@ from catacaustics.shapes import Bool, Float, Int, UInt8
 SPLITS = ("train", "val", "test", "generator")
 """generator: frames without a path-traced reference, for the R-buffer generator, whose truth is cheap."""
 CARD = "card.json"
+FORMAT = 2
+"""Of data sets; 2 has the probe's panorama."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,6 +73,12 @@ class Frame:
     """Texture colour of the opaque scene from the same camera, sRGB-encoded; 0 x 0 pixels in the split generator."""
     screen_depth: Float[np.ndarray, "s s"]
     """Distance along the viewing axis at the pixels of `screen`."""
+    probe: UInt8[np.ndarray, "v u 3"]
+    """Texture colour of the opaque scene all around `probe_position`, sRGB-encoded, equirectangular, u = 2 v: columns
+    run from azimuth -180 to 180 degrees, atan2(y, x), rows from straight up to straight down; 0 x 0 pixels in the split
+    generator."""
+    probe_position: Float[np.ndarray, "3"]
+    """Amid the transparent objects."""
     world_to_clip: Float[np.ndarray, "4 4"]
     """p = M @ (x, y, z, 1); ndc = p[:3] / p[3]: x to the right, y up, -1 and 1 at the edges of the image."""
     camera_position: Float[np.ndarray, "3"]
@@ -100,6 +108,8 @@ _STORED = {
     "internal_reflection": bool,
     "screen": "png",
     "screen_depth": "inverse",
+    "probe": "png",
+    "probe_position": np.float32,
     "world_to_clip": np.float32,
     "camera_position": np.float32,
     "parameters": np.float32,
@@ -263,6 +273,22 @@ class Frames:
         return Frames(self.card, self.textures, self.damaged, [p for p in self._places if p.split == name])
 
 
+def read_card(folder: Path) -> dict[str, Any]:
+    """The data card.
+
+    Raises:
+        UserError: there is none, or it is of another format.
+    """
+    card = read_json(folder / CARD)
+    if card.get("format", 1) != FORMAT:
+        raise UserError(
+            f"{folder} holds a data set of format {card.get('format', 1)}.",
+            f"format {FORMAT}",
+            "make it again in an empty folder: catacaustics refract data",
+        )
+    return card
+
+
 def open_frames(folder: Path) -> Frames:
     """Open a data set. Shards that are missing or corrupt are named in one warning, and the rest is used.
 
@@ -270,7 +296,7 @@ def open_frames(folder: Path) -> Frames:
         UserError: no data set, a texture is missing, or no shard is usable.
     """
     folder = Path(folder)
-    card = read_json(folder / CARD)
+    card = read_card(folder)
     textures = [read_image_bytes(folder / name, upright=False) for name in card["textures"]]
     places, damaged = [], []
     for shard in card["shards"]:

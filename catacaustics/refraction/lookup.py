@@ -1,4 +1,4 @@
-"""Colours at landing points: by texture coordinates, by the camera and a screen-space colour buffer, or by both.
+"""Colours at landing points: by texture coordinates, by a screen-space colour buffer, or by a probe's panorama.
 
 All images are channels first. ndc: x to the right, y up, -1 and 1 at the edges of the image.
 """
@@ -37,6 +37,18 @@ def sample_screen(screen: Float[Tensor, "b c s s"], ndc: Float[Tensor, "b 2 h w"
     return grid_sample(screen, grid, "bilinear", "border", align_corners=False)
 
 
+def sample_probe(
+    probe: Float[Tensor, "b c v u"], position: Float[Tensor, "b 3"], points: Float[Tensor, "b 3 h w"]
+) -> Float[Tensor, "b c h w"]:
+    """Bilinear lookup in a panorama, as `Frame.probe`, in the directions of points as seen from its position."""
+    x, y, z = (points - position[..., None, None]).unbind(1)
+    azimuth, elevation = torch.atan2(y, x), torch.atan2(z, torch.hypot(x, y))
+    columns = probe.shape[-1]
+    around = torch.cat([probe[..., -1:], probe, probe[..., :1]], -1)
+    grid = torch.stack([azimuth / torch.pi * columns / (columns + 2), -2 * elevation / torch.pi], -1)
+    return grid_sample(around, grid, "bilinear", "border", align_corners=False)
+
+
 def inside_screen(ndc: Float[Tensor, "b 2 h w"], edge: float = 0.0) -> Float[Tensor, "b 1 h w"]:
     """1 in the image and 0 outside; with an `edge`, in ndc, it falls linearly to 0 towards the image's border."""
     distance = 1 - ndc.abs().amax(1, keepdim=True)
@@ -53,38 +65,6 @@ def visibility(
     units), 0 beyond twice of it, linear between. Off the screen the value means nothing."""
     difference = (sample_screen(screen_depth, ndc) - depth).abs()
     return (2 - difference / tolerance).clamp(0, 1)
-
-
-def snap(
-    points: Float[Tensor, "b 3 h w"],
-    origins: Float[Tensor, "b 3 h w"],
-    world_to_clip: Float[Tensor, "b 4 4"],
-    screen_depth: Float[Tensor, "b 1 s s"],
-    reach: float,
-    steps: int = 24,
-) -> Float[Tensor, "b 3 h w"]:
-    """Move points along their ray to where it meets the surface that the camera sees, at most by `reach` (scene units).
-
-    The ray is followed from point - reach to point + reach; of the places where it goes below the surface the one
-    nearest to the point is taken, found by linear interpolation. Points without such a place stay.
-    """
-    distance = (points - origins).norm(dim=1, keepdim=True)
-    ray = (points - origins) / distance.clamp_min(1e-6)
-    low = (distance - reach).clamp_min(0)
-    step = (distance + reach - low) / steps
-    best, shift = torch.full_like(distance, torch.inf), torch.zeros_like(distance)
-    before: Tensor | None = None
-    for i in range(steps + 1):
-        ndc, depth = project(origins + (low + i * step) * ray, world_to_clip)
-        below = depth - sample_screen(screen_depth, ndc)
-        if before is not None:
-            # Far below means that the ray has gone behind something, not into it.
-            meets = (before < 0) & (below >= 0) & (below < 2 * step) & (inside_screen(ndc) > 0)
-            moved = low + (i - below / (below - before).clamp_min(1e-6)) * step - distance
-            nearer = meets & (moved.abs() < best)
-            best, shift = torch.where(nearer, moved.abs(), best), torch.where(nearer, moved, shift)
-        before = below
-    return points + shift * ray
 
 
 class Textures:
@@ -123,7 +103,9 @@ class Textures:
 
 
 class Screen(NamedTuple):
-    """Screen-space buffers of the opaque scene, one frame each."""
+    """Pictures of the opaque scene that landing points are looked up in: from the camera, and all around the probe."""
 
     color: Float[Tensor, "b 3 s s"]
     depth: Float[Tensor, "b 1 s s"]
+    probe: Float[Tensor, "b 3 v u"]
+    probe_position: Float[Tensor, "b 3"]

@@ -8,21 +8,30 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import cross_entropy, one_hot
+from torch.nn.functional import adaptive_avg_pool2d, cross_entropy, one_hot
 
 from catacaustics.errors import UserError
 from catacaustics.files import read_tensors, write_tensors
 from catacaustics.losses import total_variation
 from catacaustics.refraction.buffers import Buffers
 from catacaustics.refraction.frames import Frames
-from catacaustics.refraction.lookup import Screen, Textures, inside_screen, project, sample_screen, snap, visibility
-from catacaustics.refraction.networks import SIZES, Generator, Renderer, nearest_object
+from catacaustics.refraction.lookup import (
+    Screen,
+    Textures,
+    inside_screen,
+    project,
+    sample_probe,
+    sample_screen,
+    visibility,
+)
+from catacaustics.refraction.networks import SIZES, Generator, Renderer
 from catacaustics.shapes import Bool, Float, Int, UInt8
 
 FORMAT = 1
 Kind = Literal["uv", "world", "screen", "hybrid"]
-"""What a generator predicts: texture coordinates of every opaque object and which object it is (CrystalNet); world
-coordinates (SSNRB); screen coordinates (SSNRB's ablation); all of the first two (ours)."""
+"""What a generator predicts and where its colours are looked up: texture coordinates of every opaque object and which
+object it is (CrystalNet); world coordinates, on the screen (SSNRB); screen coordinates (SSNRB's ablation); world
+coordinates, on the screen and by a probe (ours)."""
 
 MODELS: dict[str, Kind | None] = {
     "glassnet": None,
@@ -33,13 +42,12 @@ MODELS: dict[str, Kind | None] = {
 }
 """Renderers, and the kind of their R-buffer."""
 
-R_CHANNELS = 6
-"""Colour and normal at the landing point."""
+BLURRED_ROWS = (64, 16)
+"""hybrid: rows of the panorama made smaller, cells of 2.8 and 11 degrees: how blurred the further colours are."""
 _FAR_NDC = 2.0
 """Screen coordinates are learned up to here; what lands farther outside the image counts as landing there."""
-EDGE, TOLERANCE, REACH = 0.02, 0.05, 0.3
-"""hybrid: softness at the image's border (ndc) and of the occlusion test, and how far points are moved along their ray
-onto what the camera sees (scene units)."""
+EDGE, TOLERANCE = 0.02, 0.1
+"""hybrid: softness at the image's border (ndc) and of the occlusion test (scene units)."""
 
 
 class Prediction(NamedTuple):
@@ -77,21 +85,23 @@ def kind_of(model: str) -> Kind | None:
 
 def output_channels(kind: Kind, textures: int) -> int:
     """Channels of a generator for a scene with so many textures."""
-    return 3 + {"uv": 3 * textures, "world": 3, "screen": 2, "hybrid": 3 + 3 * textures}[kind]
+    return 3 + {"uv": 3 * textures, "world": 3, "screen": 2, "hybrid": 3}[kind]
+
+
+def r_channels(kind: Kind | None) -> int:
+    """Of an R-buffer: colour and normal at the landing point; hybrid's has more colours, blurred."""
+    return {None: 0, "hybrid": 6 + 3 * len(BLURRED_ROWS)}.get(kind, 6)
 
 
 def split_output(kind: Kind, output: Float[Tensor, "b c h w"]) -> Prediction:
     """Name the channels of a generator's output."""
     normal, rest = output[:, :3], output[:, 3:]
-    world = ndc = uv = logits = None
-    if kind in ("world", "hybrid"):
-        world, rest = rest[:, :3], rest[:, 3:]
-    if kind == "screen":
-        ndc = rest
-    if kind in ("uv", "hybrid"):
+    if kind == "uv":
         t = rest.shape[1] // 3
-        uv, logits = rest[:, : 2 * t].unflatten(1, (t, 2)), rest[:, 2 * t :]
-    return Prediction(normal, world, ndc, uv, logits)
+        return Prediction(normal, None, None, rest[:, : 2 * t].unflatten(1, (t, 2)), rest[:, 2 * t :])
+    return (
+        Prediction(normal, None, rest, None, None) if kind == "screen" else Prediction(normal, rest, None, None, None)
+    )
 
 
 def truth(kind: Kind, buffers: Buffers, textures: int) -> Prediction:
@@ -99,7 +109,7 @@ def truth(kind: Kind, buffers: Buffers, textures: int) -> Prediction:
     world = buffers.landing if kind in ("world", "hybrid") else None
     ndc = project(buffers.landing, buffers.world_to_clip)[0] if kind == "screen" else None
     uv = logits = None
-    if kind in ("uv", "hybrid"):
+    if kind == "uv":
         uv = buffers.landing_uv[:, None].expand(-1, textures, -1, -1, -1)
         logits = one_hot(buffers.landing_object.clamp_min(0), textures).movedim(-1, 1).float()
     return Prediction(buffers.landing_normal, world, ndc, uv, logits)
@@ -161,37 +171,39 @@ def landing_color(
     """Colour (albedo, sRGB-encoded) at the predicted landing points.
 
     uv: bilinear in the texture of the most probable object. world: p_ndc = (P V p)_xyz / (P V p)_w, bilinear in the
-    screen-space colour buffer, clamped to its border. hybrid: points are first moved along their ray from the glass
-    onto the surface that the camera sees, if that is near; then as world where the point is on the screen and its depth
-    is the screen's, as uv elsewhere, with a soft step between.
+    screen-space colour buffer, clamped to its border. hybrid: as world where the point is on the screen and
+    its depth is the screen's, in the probe's panorama elsewhere, with a soft step between.
     """
-    by_uv = by_screen = None
     if prediction.uv is not None and prediction.logits is not None:
         index = prediction.logits.argmax(1)
-        by_uv = textures.sample(index, select(prediction.uv, index))
-        if kind == "uv":
-            return by_uv
+        return textures.sample(index, select(prediction.uv, index))
     assert screen is not None, "this kind looks colours up on the screen"
     if prediction.ndc is not None:
         return sample_screen(screen.color, prediction.ndc)
     assert prediction.world is not None
-    world = prediction.world
-    if kind == "hybrid":
-        world = snap(world, nearest_object(buffers)[0][:, 1:4], buffers.world_to_clip, buffers.depth, REACH)
-    ndc, depth = project(world, buffers.world_to_clip)
+    ndc, depth = project(prediction.world, buffers.world_to_clip)
     by_screen = sample_screen(screen.color, ndc)
-    if by_uv is None:
+    if kind == "world":
         return by_screen
     share = inside_screen(ndc, EDGE) * visibility(screen.depth, ndc, depth, TOLERANCE)
-    return share * by_screen + (1 - share) * by_uv
+    return share * by_screen + (1 - share) * sample_probe(screen.probe, screen.probe_position, prediction.world)
+
+
+def blurred_colors(world: Float[Tensor, "b 3 h w"], screen: Screen) -> Float[Tensor, "b c h w"]:
+    """Colours around landing points, by the probe, for every entry of BLURRED_ROWS: where a point is only roughly
+    known, the mean colour around it says more than the colour of one texel."""
+    coarse = [adaptive_avg_pool2d(screen.probe, (rows, 2 * rows)) for rows in BLURRED_ROWS]
+    return torch.cat([sample_probe(probe, screen.probe_position, world) for probe in coarse], 1)
 
 
 def r_buffer(
     kind: Kind, prediction: Prediction, buffers: Buffers, screen: Screen | None, textures: Textures
-) -> Float[Tensor, "b 6 h w"]:
-    """Colour and normal at the landing points, zero where no transparent object is seen."""
-    color = landing_color(kind, prediction, buffers, screen, textures)
-    return torch.cat([color, prediction.normal], 1) * buffers.covered
+) -> Float[Tensor, "b r h w"]:
+    """Colour and normal at the landing points, then hybrid's blurred colours; zero where there is no glass."""
+    parts = [landing_color(kind, prediction, buffers, screen, textures), prediction.normal]
+    if kind == "hybrid" and prediction.world is not None and screen is not None:
+        parts.append(blurred_colors(prediction.world, screen))
+    return torch.cat(parts, 1) * buffers.covered
 
 
 def needs_screen(kind: Kind | None) -> bool:
@@ -285,12 +297,12 @@ class RefractionModel(nn.Module):
 
 
 def new_generator(kind: Kind, size: str, textures: int) -> Generator:
-    world, places = kind in ("world", "hybrid"), 3 * textures if kind == "hybrid" else 0
-    return Generator(output_channels(kind, textures), SIZES[size], world, places).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+    world = kind in ("world", "hybrid")
+    return Generator(output_channels(kind, textures), SIZES[size], world).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
 
 def new_renderer(kind: Kind | None, size: str) -> Renderer:
-    return Renderer(R_CHANNELS if kind else 0, SIZES[size]).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+    return Renderer(r_channels(kind), SIZES[size]).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
 
 def save_part(path: Path, network: nn.Module, header: dict[str, Any], extra: dict[str, Tensor] | None = None) -> None:

@@ -167,14 +167,11 @@ class Generator(nn.Module):
     Args:
         outputs: channels.
         world: whether there are world coordinates.
-        places: of the outputs, the last ones that depend on the world coordinates: a small network of its own learns
-            from the true ones which texture coordinates and object belong to a point, and is given the predicted ones.
-            It takes the other network's code as it is: learning textures must not cost accuracy of directions.
     """
 
-    def __init__(self, outputs: int, size: Size, world: bool, places: int):
+    def __init__(self, outputs: int, size: Size, world: bool):
         super().__init__()
-        self.octaves, self.direct, self.world = size.octaves, outputs - places, world
+        self.octaves, self.world = size.octaves, world
         self.objects = ObjectEncoder(size)
         self.trunk = UNet(size.width + 3 * (1 + 2 * size.octaves) + 3 + 1 + 4 * 3, size)
         # How rays bend is a function of the pixel's own surface: most of the capacity is here, which costs little.
@@ -182,13 +179,9 @@ class Generator(nn.Module):
         first, second = _conv(2 * size.width + 4 * 3, inside, 1), _conv(inside, inside, 1)
         self.head = nn.Sequential(first, nn.ReLU(), second, nn.ReLU())
         # At the start the ray goes straight on.
-        bias = [0.0] * self.direct + [0.5, 1.0, 0.0, 0.0, 0.0] * world
+        bias = [0.0] * outputs + [0.5, 1.0, 0.0, 0.0, 0.0] * world
         self.last = _biased(nn.Conv2d(inside, len(bias), 1), bias)
         self.last.weight.data *= 0.1
-        self.place: nn.Sequential | None = None
-        if places:
-            first, second = _conv(inside + 3 * (1 + 2 * 4), inside, 1), _conv(inside, inside, 1)
-            self.place = nn.Sequential(first, nn.ReLU(), second, nn.ReLU(), nn.Conv2d(inside, places, 1))
 
     def forward(self, buffers: Buffers) -> Float[Tensor, "b outputs h w"]:
         objects = self.objects(buffers)
@@ -197,19 +190,13 @@ class Generator(nn.Module):
         ways = [buffers.rays, *guesses]
         geometry = [encode(buffers.position, self.octaves), buffers.normal, buffers.depth]
         x = self.trunk(_join(objects, *geometry, *ways))
-        code = self.head(_join(x, objects, *ways))
-        x = _precise(self.last, code)
+        x = _precise(self.last, self.head(_join(x, objects, *ways)))
         if not self.world:
             return x
-        x, distance, shares = x[:, : self.direct], softplus(x[:, -5:-4]), x[:, -4:]
+        x, distance, shares = x[:, :-5], softplus(x[:, -5:-4]), x[:, -4:]
         bent = sum(share * way for share, way in zip(shares.split(1, 1), ways, strict=True))
         landing = nearest[:, 1:4] + distance * normalize(bent + x[:, 3:6], dim=1)
-        x = torch.cat([x[:, :3], landing], 1)
-        if self.place is None:
-            return x
-        if self.training:
-            landing = torch.where(buffers.landing_object[:, None] >= 0, buffers.landing, landing.detach())
-        return torch.cat([x, _precise(self.place, _join(code.detach(), encode(landing, 4)))], 1)
+        return torch.cat([x[:, :3], landing], 1)
 
 
 class Renderer(nn.Module):

@@ -276,6 +276,26 @@ class Stage:
         size = (camera.height, camera.width)
         return {n: a.T.reshape(*size, 3) if a.ndim == 2 else a.reshape(size) for n, a in arrays.items()}
 
+    def probe(self, rows: int) -> tuple[UInt8[np.ndarray, "v u 3"], Float[np.ndarray, "3"]]:
+        """Texture colour of the opaque bodies all around the middle of the transparent ones, as `Frame.probe`, and
+        where that is."""
+        import drjit as dr
+        import mitsuba as mi
+
+        named = {b.name: b for b in self.scene.bodies}
+        center = np.mean([_pose(b, named).center for b in self.scene.transparent], 0)
+        index = dr.arange(mi.UInt32, 2 * rows * rows)
+        step = dr.opaque(mi.Float, np.pi / rows)
+        azimuth = (mi.Float(index % (2 * rows)) + 0.5) * step - dr.pi
+        polar = (mi.Float(index // (2 * rows)) + 0.5) * step
+        level = dr.sin(polar)
+        directions = mi.Vector3f(level * dr.cos(azimuth), level * dr.sin(azimuth), dr.cos(polar))
+        origin = mi.Point3f(*(dr.opaque(mi.Float, float(x)) for x in center))
+        hit = self.opaque.ray_intersect(mi.Ray3f(origin, directions))
+        colour = [_encoded(c) for c in hit.bsdf().eval_diffuse_reflectance(hit)]
+        image = np.stack([np.array(c) for c in colour], -1).reshape(rows, 2 * rows, 3)
+        return np.round(255 * np.clip(image, 0, 1)).astype(np.uint8), center.astype(np.float32)
+
     def alone(self, camera: Camera) -> dict[str, np.ndarray]:
         """Every transparent body as if it stood alone: object_mask, object_position, object_normal, object_depth."""
         directions = normalize(camera_rays(camera))

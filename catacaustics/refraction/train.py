@@ -199,8 +199,8 @@ def keep_content(r_buffer: Tensor, content: str) -> Tensor:
     """The R-buffer with colour or normal set to zero, where not both are wanted."""
     if content == "both" or not r_buffer.shape[1]:
         return r_buffer
-    keep = torch.zeros(r_buffer.shape[1], device=r_buffer.device)
-    keep[slice(0, 3) if content == "color" else slice(3, 6)] = 1
+    keep = torch.full((r_buffer.shape[1],), float(content == "color"), device=r_buffer.device)
+    keep[3:6] = float(content == "normal")
     return r_buffer * keep[:, None, None]
 
 
