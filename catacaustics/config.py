@@ -492,7 +492,8 @@ class RefractTrainConfig:
     size: Literal["small", "base", "paper"] = "small"
     """Of the networks: 16, 32 or 64 channels in the first level."""
     minutes: float | None = None
-    """Stop after this much training time of both parts together; schedules then follow time instead of steps."""
+    """Stop after this much training time of both parts together; schedules then follow time instead of steps. Reading
+    frames ahead and baking R-buffers for the renderer, once, do not count."""
     generator_share: float = 0.5
     """Of the minutes; a model without generator gives them all to its renderer."""
     steps: int = 20_000
@@ -525,6 +526,9 @@ class RefractTrainConfig:
     are always run in float32."""
     content: Literal["both", "color", "normal"] = "both"
     """What the renderer gets of the R-buffer."""
+    coordinates: Literal["predicted", "true"] = "predicted"
+    """true: the renderer learns and is measured with the true landing points, as a perfect generator would give them:
+    how good the lookups could be. No generator is trained."""
     cache_gb: float = 4.0
     """Memory for frames that are kept; others are read from disk each time."""
     checkpoint_minutes: float = 2.0
@@ -565,6 +569,9 @@ class RefractReportConfig:
     """Training time of each model, generator and renderer together."""
     generator_share: float = 0.5
     """Of the minutes; a model without generator gives them all to its renderer."""
+    coordinates: Literal["predicted", "true"] = "predicted"
+    """true: renderers get the true landing points for the renderer's share of the minutes: the best that lookups can
+    give."""
     clock: Literal["wall", "cpu"] = "wall"
     """What minutes are measured by; cpu: processor time of this process, fair where others use the machine too."""
     split: Literal["test", "val", "train"] = "test"

@@ -15,6 +15,7 @@ from catacaustics.files import read_json, write_json
 from catacaustics.refraction import models as m
 from catacaustics.refraction import train as training
 from catacaustics.refraction.buffers import BufferCache, frame_buffers, frame_screen, stack
+from catacaustics.refraction.evaluate import render_frame
 from catacaustics.refraction.frames import open_frames, write_shard
 from catacaustics.refraction.lookup import (
     Textures,
@@ -312,6 +313,16 @@ def test_a_model_without_generator_gives_all_its_minutes_to_the_renderer(data, t
         assert minutes.get("generator", 0) == (4 if name == "ssnrb" else 0)
 
 
+def test_with_true_coordinates_no_generator_is_trained_and_the_right_colours_are_looked_up(data, tmp_path):
+    config = RefractTrainConfig(data, tmp_path / "run", "crystalnet", coordinates="true", **SMALL)
+    training.train(config)
+    assert not (tmp_path / "run" / "generator.safetensors").exists()
+    model, frame = m.load_model(config.run, open_frames(data)), open_frames(data).split("test")[0]
+    view = render_frame(model, frame)
+    assert np.abs(view.looked_up - view.true_color)[frame.landing_object >= 0].max() < 1e-5
+    refused(["true coordinates", "no generator"], training.train, replace(config, part="generator"))
+
+
 def test_content_keeps_the_colour_or_the_normal_of_the_r_buffer():
     r_buffer = torch.rand(1, 6, 4, 4) + 0.1
     assert torch.equal(training.keep_content(r_buffer, "both"), r_buffer)
@@ -328,6 +339,9 @@ def test_frames_beyond_the_memory_limit_are_read_again(data):
     for i in range(4):
         assert torch.equal(cache.get(i).reference, frame_buffers(frames[i]).reference)
     assert list(cache.kept) == [2, 3]
+    ahead = BufferCache([frames], 2.5 * one)
+    ahead.fill()
+    assert list(ahead.kept) == [0, 1]
     assert cache.bytes == 2 * one
 
 

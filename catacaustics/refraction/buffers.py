@@ -145,16 +145,18 @@ class BufferCache:
         if index in self.kept:
             self.kept.move_to_end(index)
             return self.kept[index]
-        return self.keep(index, frame_buffers(self.frame(index)))
-
-    def keep(self, index: int, buffers: Buffers) -> Buffers:
-        """Keep the buffers of a frame that was read by other means."""
-        if index not in self.kept:
-            self.kept[index] = buffers
-            self.bytes += _size(buffers)
-            while self.bytes > self.most and len(self.kept) > 1:
-                self.bytes -= _size(self.kept.popitem(last=False)[1])
+        buffers = self.kept[index] = frame_buffers(self.frame(index))
+        self.bytes += _size(buffers)
+        while self.bytes > self.most and len(self.kept) > 1:
+            self.bytes -= _size(self.kept.popitem(last=False)[1])
         return buffers
+
+    def fill(self) -> None:
+        """Read frames in order, as many as are kept, so that no training time is spent on it."""
+        for index in range(sum(map(len, self.splits))):
+            size = _size(self.get(index))
+            if self.bytes + size > self.most:
+                break
 
 
 def _size(buffers: Buffers) -> int:

@@ -264,16 +264,24 @@ class RefractionModel(nn.Module):
         size: a key of SIZES.
         layout: of the scene it belongs to.
         textures: of the scene's opaque objects.
+        coordinates: "predicted" by the generator, or "true".
     """
 
     def __init__(
-        self, name: str, size: str, layout: Layout, textures: Sequence[np.ndarray], device: torch.device | str
+        self,
+        name: str,
+        size: str,
+        layout: Layout,
+        textures: Sequence[np.ndarray],
+        device: torch.device | str,
+        coordinates: str = "predicted",
     ):
         super().__init__()
-        self.name, self.size, self.layout = name, size, layout
+        self.name, self.size, self.layout, self.coordinates = name, size, layout, coordinates
         self.kind: Kind | None = kind_of(name)
         self.textures = Textures(textures, device)
-        self.generator = new_generator(self.kind, size, len(textures)).to(device) if self.kind else None
+        learned = self.kind is not None and coordinates == "predicted"
+        self.generator = new_generator(self.kind, size, len(textures)).to(device) if self.kind and learned else None
         self.renderer = new_renderer(self.kind, size).to(device)
 
     @property
@@ -281,7 +289,9 @@ class RefractionModel(nn.Module):
         return self.textures.texels.device
 
     def predict(self, buffers: Buffers) -> Prediction | None:
-        """The generator's output; None for glassnet."""
+        """The generator's output, or the truth; None for glassnet."""
+        if self.kind and self.coordinates == "true":
+            return truth(self.kind, buffers, len(self.textures))
         return split_output(self.kind, self.generator(buffers)) if self.generator and self.kind else None
 
     def bake(self, buffers: Buffers, screen: Screen | None) -> Float[Tensor, "b r h w"]:
@@ -353,7 +363,14 @@ def load_model(run: Path, frames: Frames, device: torch.device | str = "cpu") ->
     weights, _, header = load_part(run / "renderer.safetensors")
     kind_of(header["model"])
     check_layout(header["layout"], header["size"], frames, int(frames.card["resolution"]))
-    model = RefractionModel(header["model"], header["size"], header["layout"], frames.textures, device)
+    model = RefractionModel(
+        header["model"],
+        header["size"],
+        header["layout"],
+        frames.textures,
+        device,
+        header.get("coordinates", "predicted"),
+    )
     fill(model.renderer, weights, run / "renderer.safetensors")
     if model.generator is not None:
         weights, _, _ = load_part(run / "generator.safetensors")

@@ -50,6 +50,7 @@ def report(config: RefractReportConfig) -> dict[str, Any]:
             seed=seed,
             minutes=config.minutes,
             generator_share=config.generator_share,
+            coordinates=config.coordinates,
             clock=config.clock,
             steps=10**9,
             device=config.device,
@@ -80,7 +81,9 @@ def _finished(settings: RefractTrainConfig, config: RefractReportConfig) -> dict
     path, name = folder / "metrics.json", folder.name
     if (folder / "config.json").is_file():
         found, wanted = read_json(folder / "config.json"), _plain(asdict(settings))
-        differing = [k for k in ("data", "minutes", "generator_share", "clock") if found.get(k) != wanted[k]]
+        differing = [
+            k for k in ("data", "minutes", "generator_share", "coordinates", "clock") if found.get(k) != wanted[k]
+        ]
         if differing:
             key = differing[0]
             raise UserError(
@@ -137,7 +140,8 @@ def markdown(result: dict[str, Any]) -> str:
     settings = result["settings"]
     lines = [
         f"{settings['minutes']:g} min of {settings['clock']} time each, {settings['generator_share']:.0%} of it for "
-        f"the generator where there is one; seeds {', '.join(map(str, settings['seeds']))}; {settings['split']} frames",
+        f"the generator where there is one; {settings['coordinates']} landing points; "
+        f"seeds {', '.join(map(str, settings['seeds']))}; {settings['split']} frames",
         "",
     ]
     keys = [key for key in _COLUMNS if any(key in row["mean"] for row in rows)]
@@ -226,7 +230,8 @@ def _page(config: RefractReportConfig, result: dict[str, Any]) -> str:
     name = escape(f"{frames.card['scene']}: refraction models compared")
     facts = (
         f"{config.minutes:g} min of {config.clock} time each; {config.generator_share:.0%} of it goes to the "
-        "generator, glassnet gives it all to its renderer. Numbers are means over the seeds "
+        f"generator, glassnet gives it all to its renderer. Landing points are {config.coordinates}. "
+        "Numbers are means over the seeds "
         f"{', '.join(map(str, config.seeds))}, ± their standard deviation."
     )
     header = f'<header><p class="facts">Refraction baking</p><h1>{name}</h1><p class="hint">{facts}</p></header>'

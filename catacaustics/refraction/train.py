@@ -17,7 +17,7 @@ from catacaustics.config import RefractTrainConfig
 from catacaustics.errors import UserError
 from catacaustics.files import write_bytes, write_json
 from catacaustics.losses import dssim
-from catacaustics.refraction.buffers import BufferCache, Buffers, frame_buffers, frame_screen, stack
+from catacaustics.refraction.buffers import BufferCache, Buffers, frame_screen, stack
 from catacaustics.refraction.frames import Frames, open_frames
 from catacaustics.refraction.lookup import Screen
 from catacaustics.refraction.models import (
@@ -83,12 +83,15 @@ def train(config: RefractTrainConfig) -> RefractionModel:
     _check(config, frames)
     write_json(run / "config.json", {k: str(v) if isinstance(v, Path) else v for k, v in asdict(config).items()})
     torch.manual_seed(config.seed)
-    model = RefractionModel(config.model, config.size, Layout.of(frames), frames.textures, choose_device(config.device))
+    model = RefractionModel(
+        config.model, config.size, Layout.of(frames), frames.textures, choose_device(config.device), config.coordinates
+    )
     train_frames, more = frames.split("train"), frames.split("generator")
     cache = BufferCache([train_frames, more], config.cache_gb * 2**30)
+    cache.fill()
     share = config.generator_share if kind else 0.0
     short = computes_bfloat16(model.device) if config.precision == "auto" else config.precision == "bfloat16"
-    if kind and config.part != "renderer" and config.generator is None:
+    if model.generator is not None and config.part != "renderer" and config.generator is None:
         every = range(len(train_frames) + len(more))
         minutes = config.minutes and config.minutes * share
         part = _Part("generator", every, config.lr_generator, minutes, _generator_step(model, config), short)
@@ -100,7 +103,8 @@ def train(config: RefractTrainConfig) -> RefractionModel:
                 write_bytes(run / "generator.safetensors", config.generator.read_bytes())
         minutes = config.minutes and config.minutes * (1 - share)
         every = range(len(train_frames))
-        part = _Part("renderer", every, config.lr_renderer, minutes, _renderer_step(model, cache, config), short)
+        step = _renderer_step(model, _baked(model, cache, every, config), config)
+        part = _Part("renderer", every, config.lr_renderer, minutes, step, short)
         _fit(model.renderer, part, cache, model, config)
     return model.eval()
 
@@ -119,8 +123,9 @@ def _check(config: RefractTrainConfig, frames: Frames) -> None:
     check_layout(Layout.of(frames), config.size, frames, min(config.crop, side) or side)
     if not len(frames.split("train")):
         raise UserError(f"{config.data} has no training frames.", "one or more", "make them: --train of refract data")
-    if config.part == "generator" and kind_of(config.model) is None:
-        raise UserError(f"{config.model} has no generator.", "another model or part", "leave --part out")
+    if config.part == "generator" and (kind_of(config.model) is None or config.coordinates == "true"):
+        found = config.model + " with true coordinates" * (config.coordinates == "true")
+        raise UserError(f"{found} has no generator.", "another model or part", "leave --part out")
     parts = ("generator", "renderer") if config.part == "both" else (config.part,)
     found = [p for p in parts for f in (f"{p}.safetensors", f"{p}.checkpoint.safetensors") if (run / f).exists()]
     if found and not config.resume:
@@ -164,28 +169,29 @@ def _generator_step(
     return losses
 
 
-def _renderer_step(
-    model: RefractionModel, cache: BufferCache, config: RefractTrainConfig
-) -> Callable[[Buffers, list[Place]], dict[str, Tensor]]:
-    """L1 + DSSIM. The generator is frozen, so every frame's R-buffer is computed once and kept."""
-    baked: dict[int, Tensor] = {}
-    device = model.device
+def _baked(model: RefractionModel, cache: BufferCache, indices: range, config: RefractTrainConfig) -> list[Tensor]:
+    """The R-buffers of frames, float16. The generator is frozen: each is computed once, before the renderer's time."""
+    if (Path(config.run) / "renderer.safetensors").exists():
+        return []
+    baked = []
+    for index in tqdm(indices, desc="R-buffers", unit="frame", disable=model.kind is None):
+        screen: Screen | None = None
+        if needs_screen(model.kind):
+            screen = Screen(*(value.to(model.device) for value in frame_screen(cache.frame(index))))
+        with torch.no_grad():
+            whole = model.bake(cache.get(index).to(model.device), screen)
+        baked.append(keep_content(whole, config.content).half().cpu())
+    return baked
 
-    def r_buffer(index: int) -> Tensor:
-        if index not in baked:
-            screen: Screen | None = None
-            if needs_screen(model.kind):
-                frame = cache.frame(index)
-                cache.keep(index, frame_buffers(frame))
-                screen = Screen(*(value.to(device) for value in frame_screen(frame)))
-            with torch.no_grad(), torch.autocast(device.type, enabled=False):
-                whole = model.bake(cache.get(index).to(device), screen)
-            baked[index] = keep_content(whole, config.content).half().cpu()
-        return baked[index]
+
+def _renderer_step(
+    model: RefractionModel, baked: list[Tensor], config: RefractTrainConfig
+) -> Callable[[Buffers, list[Place]], dict[str, Tensor]]:
+    """L1 + DSSIM."""
 
     def losses(batch: Buffers, places: list[Place]) -> dict[str, Tensor]:
         side = batch.reference.shape[-1]
-        parts = [r_buffer(i)[..., y : y + side, x : x + side].to(device).float() for i, y, x in places]
+        parts = [baked[i][..., y : y + side, x : x + side].to(model.device).float() for i, y, x in places]
         image = model.renderer(batch, torch.cat(parts))
         error = (image - batch.reference).abs().mean()
         b, c, height, width = image.shape
@@ -246,7 +252,7 @@ def _start(network: nn.Module, part: _Part, config: RefractTrainConfig) -> PartS
 
 
 def _header(state: PartState, model: RefractionModel) -> dict[str, Any]:
-    own = {"model": model.name, "size": model.size, "layout": model.layout._asdict()}
+    own = {"model": model.name, "size": model.size, "layout": model.layout._asdict(), "coordinates": model.coordinates}
     return own | {"step": state.step, "seconds": state.seconds}
 
 
