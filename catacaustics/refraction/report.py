@@ -231,8 +231,7 @@ def _page(config: RefractReportConfig, result: dict[str, Any]) -> str:
     facts = (
         f"{config.minutes:g} min of {config.clock} time each; {config.generator_share:.0%} of it goes to the "
         f"generator, glassnet gives it all to its renderer. Landing points are {config.coordinates}. "
-        "Numbers are means over the seeds "
-        f"{', '.join(map(str, config.seeds))}, ± their standard deviation."
+        f"{_seeds(config)}."
     )
     header = f'<header><p class="facts">Refraction baking</p><h1>{name}</h1><p class="hint">{facts}</p></header>'
     rows = result["means"]
@@ -246,6 +245,12 @@ def _page(config: RefractReportConfig, result: dict[str, Any]) -> str:
         f"<section><h2>Details</h2>{details_html('Measures', definitions_html(MEASURES), opened=True)}</section>",
     ]
     return zoom_page(name, "\n".join(sections), style="img { image-rendering: pixelated; }")
+
+
+def _seeds(config: RefractReportConfig) -> str:
+    if len(config.seeds) == 1:
+        return f"One seed, {config.seeds[0]}: differences as small as those between seeds mean nothing"
+    return f"Numbers are means over the seeds {', '.join(map(str, config.seeds))}, ± their standard deviation"
 
 
 def _html_table(heads: list[str], rows: list[list[str]]) -> str:
@@ -301,9 +306,7 @@ def _articles(config: RefractReportConfig, result: dict[str, Any]) -> list[str]:
         images += [enlarged(name, view.image) for name, view in views.items()]
         lookups = [enlarged("True colour at the landing points", true_color)]
         lookups += [
-            enlarged(f"{name} looks nothing up", np.zeros_like(view.image))
-            if view.looked_up is None
-            else enlarged(f"{name}: looked up", view.looked_up)
+            None if view.looked_up is None else enlarged(f"{name}: looked up", view.looked_up)
             for name, view in views.items()
         ]
         errors = [enlarged("Direct light, no glass", frame.direct)]
@@ -313,7 +316,7 @@ def _articles(config: RefractReportConfig, result: dict[str, Any]) -> list[str]:
             errors.append(enlarged(f"{name}: FLIP {strip}", error_image(flip, frame.refractive)))
         style = f'style="grid-template-columns: repeat({len(images)}, minmax(0, 1fr))"'
         grids = "".join(
-            f'<div class="grid" {style}>{"".join(picture_html(p) for p in row)}</div>'
+            f'<div class="grid" {style}>{"".join(picture_html(p) if p else "<div></div>" for p in row)}</div>'
             for row in (images, lookups, errors)
         )
         articles.append(f"<article><h3>{escape(config.split)} {i}</h3>{grids}</article>")
