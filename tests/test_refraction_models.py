@@ -303,6 +303,14 @@ def test_the_generator_is_frozen_while_the_renderer_learns_and_can_be_trained_ap
     assert all(torch.equal(first[k], second[k]) for k in first)
 
 
+def test_ssnrb_and_hybrid_can_share_a_generator(trained, data, tmp_path):
+    path = trained[0] / "generator.safetensors"
+    shared = training.train(RefractTrainConfig(data, tmp_path / "run", "ssnrb", generator=path, **SMALL))
+    buffers = frame_buffers(open_frames(data).split("test")[0])
+    with torch.no_grad():
+        assert torch.equal(shared.predict(buffers).world, trained[1].predict(buffers).world)
+
+
 def test_a_model_without_generator_gives_all_its_minutes_to_the_renderer(data, tmp_path, monkeypatch):
     minutes = {}
     monkeypatch.setattr(training, "_loop", lambda state, part, *rest: minutes.update({part.name: part.minutes}))
@@ -375,8 +383,8 @@ def test_missing_damaged_and_foreign_checkpoints_are_refused(trained, data, tmp_
     whole = (run / "renderer.safetensors").read_bytes()
     (tmp_path / "renderer.safetensors").write_bytes(whole[: len(whole) // 2])
     refused(["not a complete", "--resume"], m.load_model, tmp_path, frames)
-    config = RefractTrainConfig(data, tmp_path / "b", "ssnrb", generator=run / "generator.safetensors", **SMALL)
-    refused(["generator of hybrid", "that of ssnrb"], training.train, config)
+    config = RefractTrainConfig(data, tmp_path / "b", "crystalnet", generator=run / "generator.safetensors", **SMALL)
+    refused(["generator of hybrid", "that of crystalnet"], training.train, config)
 
 
 def test_a_finished_run_is_not_overwritten_and_is_kept_with_resume(trained, data, capsys):

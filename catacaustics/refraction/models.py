@@ -83,6 +83,12 @@ def kind_of(model: str) -> Kind | None:
     return MODELS[model]
 
 
+def same_generator(first: str, second: str) -> bool:
+    """Whether the generators of two models are the same network and learn the same, as those of ssnrb and hybrid."""
+    kinds = {kind_of(first), kind_of(second)}
+    return len(kinds) == 1 or kinds == {"world", "hybrid"}
+
+
 def output_channels(kind: Kind, textures: int) -> int:
     """Channels of a generator for a scene with so many textures."""
     return 3 + {"uv": 3 * textures, "world": 3, "screen": 2, "hybrid": 3}[kind]

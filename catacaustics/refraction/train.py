@@ -30,6 +30,7 @@ from catacaustics.refraction.models import (
     kind_of,
     load_part,
     needs_screen,
+    same_generator,
     save_part,
     split_output,
 )
@@ -141,7 +142,7 @@ def _take_generator(model: RefractionModel, path: Path) -> None:
         UserError: it is missing, damaged, of another kind or of another layout.
     """
     weights, _, header = load_part(path)
-    if (header["model"], header["layout"]) != (model.name, model.layout):
+    if header["layout"] != model.layout or not same_generator(header["model"], model.name):
         raise UserError(
             f"{path} is the generator of {header['model']} for the scene {header['layout'].scene!r}.",
             f"that of {model.name} for the scene {model.layout.scene!r} with the same textures",
