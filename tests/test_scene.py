@@ -15,6 +15,7 @@ from catacaustics.training.initialize import (
     named_reflectors,
     primary_seeds,
     reflection_seeds,
+    seen_through,
     start_warps,
 )
 from catacaustics.training.selection import LADDER
@@ -58,6 +59,19 @@ def test_the_reflector_carries_the_reflection_weight_and_the_floor_does_not(capt
     mask = ball_mask(camera)
     assert weight[mask].mean() > 0.6
     assert weight[~mask].mean() < 0.1
+
+
+def test_the_environment_does_not_start_from_what_mirrors_show(capture):
+    scene = build(capture)
+    with torch.no_grad():
+        scene.primary.opacity_logits.fill_(-20.0)  # open everywhere
+    camera = capture.train[0].camera
+    config = TrainConfig(capture.root, capture.root / "run", image_size=max(camera.width, camera.height))
+    weights = seen_through(capture, scene, config)[2].numpy()[: camera.width * camera.height]
+    mirror = scene.volumes[0].project_mask(camera).ravel()
+    assert mirror.any()
+    assert (weights[mirror] == 0).all()
+    assert (weights[~mirror] > 0.99).all()
 
 
 def test_a_nearer_diffuse_wall_hides_the_reflection(capture):

@@ -284,14 +284,18 @@ def initial_scene(
 def seen_through(
     capture: Capture, scene: Scene, config: TrainConfig, size: int = 200, views: int = 24
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Directions, colours and weights of what the photographs show where the primary cloud is open."""
+    """Directions, colours and weights of what the photographs show where the primary cloud is open and no mirror is:
+    mirrors would leave ghosts in the distance behind them."""
     parts = []
     for view in capture.train[:: max(1, len(capture.train) // views)]:
         camera = scaled_camera(view.camera, min(size, config.image_size), 1.0)
         with torch.no_grad():
             layers = scene.layers(camera)
         colors = torch.from_numpy(photograph(capture, view, camera)).to(scene.device).view(-1, 3)
-        parts.append((layers.directions.view(-1, 3), colors, layers.transmittance.reshape(-1)))
+        weights = layers.transmittance
+        for volume in scene.volumes:
+            weights[torch.from_numpy(volume.project_mask(camera))] = 0
+        parts.append((layers.directions.view(-1, 3), colors, weights.reshape(-1)))
     directions, colors, weights = (torch.cat(p) for p in zip(*parts, strict=True))
     return directions, colors, weights
 
