@@ -145,7 +145,7 @@ class TrainConfig:
     and there are 30 minutes or more."""
     exposure: bool | None = None
     """Learn exposure and white balance (three gains) of each training photograph; left out, as refine_poses."""
-    lr_pose: float = 3e-4
+    lr_pose: float = 1e-3
     """Of corrections of camera poses, in radians and relative to the cameras' extent; decays to 1/10."""
     lr_exposure: float = 5e-3
     """Of the logarithms of exposure gains; decays to 1/10."""

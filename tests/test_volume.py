@@ -16,6 +16,7 @@ from catacaustics.reflectors.volume import (
     build_volume,
     lift_halfplanes,
     mask_halfplanes,
+    partly_hidden,
     volume_from_masks,
 )
 
@@ -411,6 +412,34 @@ def test_a_mask_in_two_parts_counts_as_its_hull():
     assert volume.area == pytest.approx(whole.area, rel=0.01)
 
 
+def ring_masks(body: np.ndarray, hidden: dict[int, slice]) -> list:
+    """Masks of a body in 12 views around it; in some of them columns are hidden by something that stands before it."""
+    angles = np.linspace(0, 2 * np.pi, 12, endpoint=False)
+    cameras = [camera_at((4 * np.cos(a), 1.5 * (-1) ** i, 4 * np.sin(a))) for i, a in enumerate(angles)]
+    masks = masks_of(body, cameras)
+    for i, columns in hidden.items():
+        masks[i][2][:, columns] = False
+    return masks
+
+
+@pytest.mark.parametrize("hidden", [{}, {4: slice(0, 80)}, {4: slice(0, 82), 5: slice(0, 84)}, {1: slice(85, 160)}])
+def test_masks_of_views_where_something_stands_before_the_object_are_found(hidden):
+    masks = ring_masks(0.6 * ball(), hidden)
+    assert sorted(partly_hidden(masks)) == sorted(masks[i][0] for i in hidden)
+
+
+def test_a_flat_mirror_seen_from_its_side_is_not_taken_for_a_hidden_one():
+    sheet = np.array([[x, y, z] for x in (-0.7, 0.7) for y in (-0.5, 0.5) for z in (-0.002, 0.002)])
+    angles = np.radians(np.linspace(15, 165, 13))
+    cameras = [camera_at((4 * np.cos(a), 0.8 * (-1) ** i, 4 * np.sin(a))) for i, a in enumerate(angles)]
+    assert partly_hidden(masks_of(sheet, cameras)) == []
+
+
+def test_few_masks_are_all_believed():
+    masks = ring_masks(0.6 * ball(), {4: slice(0, 80)})
+    assert partly_hidden(masks[:6]) == []
+
+
 # Captures ------------------------------------------------------------------------------------------------------------
 
 
@@ -431,6 +460,19 @@ def test_each_reflector_of_a_capture_has_its_own_volume_from_training_masks(tmp_
     np.testing.assert_allclose(build_volume(capture, "far").center, [0.9, 0, 0], atol=0.05)
     with pytest.raises(UserError, match=r"reflector chrome[\s\S]*one of: far, near"):
         build_volume(capture, "chrome")
+
+
+def test_a_mask_that_shows_part_of_the_object_is_named_and_left_out_of_its_volume(tmp_path, capsys):
+    masks = ring_masks(0.6 * ball(), {4: slice(0, 80)})
+    views = [View(f"{i}.png", camera) for i, (_, camera, _) in enumerate(masks)]
+    for view, (_, _, mask) in zip(views, masks, strict=True):
+        write_image(tmp_path / "images" / view.name, np.zeros((120, 160, 3), np.uint8))
+        write_image(tmp_path / "masks" / "ball" / view.name, mask)
+    write_capture(tmp_path, views, {"train": [v.name for v in views], "held_out": []})
+    volume = build_volume(open_capture(tmp_path), "ball")
+    assert "4.png" in capsys.readouterr().out
+    assert volume.contains(0.6 * ball()).all()
+    assert not volume_from_masks("ball", masks).contains(0.6 * ball()).all()
 
 
 def test_the_volume_moves_with_the_world():

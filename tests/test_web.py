@@ -99,7 +99,7 @@ def test_the_proposed_views_see_the_target_in_the_middle_and_bound_a_ball_better
         store = MaskStore(capture)
         changed = {i: capture.mask(capture.train[i], "ball") for i in views}
         store.masked_views = lambda reflector: []  # those on disk are of all views
-        volume, _ = store.volume("ball", changed)
+        volume = store.volume("ball", changed)[0]
         ratios = []
         for view in capture.views[::6]:
             got, true = volume.project_mask(view.camera), capture.mask(view, "ball")

@@ -46,7 +46,7 @@ class Stress:
     capture: Annotated[Path, tyro.conf.Positional]
     model: Model = "sphere"
     seeds: int = 20
-    iterations: int = 200
+    iterations: int = 800
     image_size: int = 160
     refine_poses: bool = True
     json: Path | None = None

@@ -29,6 +29,11 @@ from catacaustics.shapes import Bool, Float, Int
 
 _SMALLEST = 1e-6
 """Inscribed radius, in units of the cameras' spread, below which an intersection counts as empty."""
+_SHOWN, _LOSS = 0.8, 0.1
+"""A mask shows only part of the object where it has less than this share of the others' picture of it, and takes at
+least this share away from the pictures in two others."""
+_WITNESSES, _APART = 6, 25.0
+"""Others that it takes to say so, from directions at least so many degrees away."""
 
 
 class MaskError(UserError):
@@ -375,6 +380,61 @@ def volume_from_masks(
     return ReflectionVolume(name, halfspaces, vertices, faces)
 
 
+def partly_hidden(masks: list[tuple[str, Camera, Bool[np.ndarray, "height width"]]]) -> list[str]:
+    """Names of the views where something stands before the object: their masks show only part of it, and would cut the
+    rest off its volume.
+
+    Such a mask is smaller than the others' volume there, and takes away what two others show. Masks from nearby
+    directions are no witnesses, as the same thing may stand before them; where there are too few, none is named. Found
+    one by one, the smallest first. Raises as `volume_from_masks`.
+    """
+    found: list[str] = []
+    masks = list(masks)
+    while len(masks) > _WITNESSES:
+        hidden = _most_hidden(masks, volume_from_masks("", masks))
+        if hidden is None:
+            break
+        found.append(masks.pop(hidden)[0])
+    return found
+
+
+def _most_hidden(masks: list[tuple[str, Camera, np.ndarray]], volume: ReflectionVolume) -> int | None:
+    surface = volume.sample_surface(20_000, np.random.default_rng(0))[0]
+    spread = 2 * np.cbrt(np.linspace(0, 1, len(surface)))[:, None]
+    points = volume.center + spread * (surface - volume.center)  # stand for the volumes of some of the masks
+    planes = [lift_halfplanes(camera, mask_halfplanes(mask)) for _, camera, mask in masks]
+    outside = np.stack([(points @ p[:, :3].T + p[:, 3] > 0).any(1) for p in planes])
+    rays = normalize(np.stack([camera.center - volume.center for _, camera, _ in masks]))
+    apart = rays @ rays.T < np.cos(np.radians(_APART))
+    shares = np.ones(len(masks))
+    for i in np.flatnonzero(apart.sum(1) >= _WITNESSES):
+        rest = ~outside[apart[i]].any(0)
+        whole = _picture_area(points[rest], masks[i][1])
+        shares[i] = _picture_area(points[rest], *masks[i][1:]) / whole if whole else 1.0
+    for i in np.argsort(shares):
+        if shares[i] >= _SHOWN:
+            return None
+        rest = ~outside[apart[i]].any(0)
+        with_it = rest & ~outside[i]
+        witnesses = [masks[j][1:] for j in np.flatnonzero(apart[i])]
+        losses = sorted(1 - _picture_area(points[with_it], *w) / max(_picture_area(points[rest], *w), 1.0) for w in witnesses)
+        if losses[-2] > _LOSS:
+            return int(i)
+    return None
+
+
+def _picture_area(points: np.ndarray, camera: Camera, mask: np.ndarray | None = None) -> float:
+    """Pixels in the image, and in a mask's hull, that the convex hull of points covers; 0 where some are behind."""
+    import cv2
+
+    pixels, depth = camera.project(points)
+    if len(points) < 3 or (depth <= 0).any():
+        return 0.0
+    corners = [[0, 0], [camera.width, 0], [camera.width, camera.height], [0, camera.height]]
+    frame = np.array(corners) if mask is None else mask_hull(mask)
+    return cv2.intersectConvexConvex(cv2.convexHull(pixels.astype(np.float32)), frame.astype(np.float32))[0]
+
+
 def _border_hint(views: list[str], masks: list[tuple[str, Camera, np.ndarray]]) -> str:
     touching = [v for v, (_, _, m) in zip(views, masks, strict=True) if m[[0, -1]].any() or m[:, [0, -1]].any()]
     return f"; the masks of {_listed(touching)} touch the image border and are open there" if touching else ""
@@ -388,18 +448,33 @@ def volume_views(capture: Capture, masked: Collection[str]) -> list[View]:
 
 
 def build_volume(capture: Capture, reflector: str) -> ReflectionVolume:
-    """The volume of one of a capture's reflectors, from its masks in `volume_views`; raises as `volume_from_masks`."""
+    """The volume of one of a capture's reflectors, from its masks in `volume_views` but those that are
+    `partly_hidden`, which it prints; raises as `volume_from_masks`."""
     if reflector not in capture.reflectors:
         raise UserError(
             f"The capture {capture.root} has no masks of a reflector {reflector}.",
             f"one of: {', '.join(capture.reflectors) or 'none yet'}",
             f"paint masks: `catacaustics mask {capture.root}`",
         )
-    return volume_from_masks(reflector, volume_masks(capture, reflector))
+    masks = _painted_masks(capture, reflector)
+    hidden = partly_hidden(masks)
+    if hidden:
+        print(
+            f"volume: {reflector}'s masks in {_listed(hidden)} show less of it than the others agree on (something "
+            "stands before it?); left out"
+        )
+    return volume_from_masks(reflector, [m for m in masks if m[0] not in hidden])
 
 
 def volume_masks(capture: Capture, reflector: str) -> list[tuple[str, Camera, Bool[np.ndarray, "height width"]]]:
-    """Names, cameras and masks of the `volume_views` of one of a capture's reflectors."""
+    """Names, cameras and masks that the volume of one of a capture's reflectors is made of: those of `volume_views`
+    that show all of it."""
+    masks = _painted_masks(capture, reflector)
+    hidden = partly_hidden(masks)
+    return [m for m in masks if m[0] not in hidden]
+
+
+def _painted_masks(capture: Capture, reflector: str) -> list[tuple[str, Camera, np.ndarray]]:
     masked = {v.name for v in capture.views if capture.mask_path(v, reflector).is_file()}
     masks = [(v.name, v.camera, capture.mask(v, reflector)) for v in volume_views(capture, masked)]
     return [(name, camera, mask) for name, camera, mask in masks if mask is not None]

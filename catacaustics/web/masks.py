@@ -25,6 +25,7 @@ from catacaustics.reflectors.volume import (
     MaskError,
     ReflectionVolume,
     mask_hull,
+    partly_hidden,
     volume_from_masks,
     volume_views,
     write_volume,
@@ -196,9 +197,9 @@ class MaskStore:
 
     def volume(
         self, reflector: str, changed: Mapping[int, Bool[np.ndarray, "height width"]] | None = None
-    ) -> tuple[ReflectionVolume, dict[int, np.ndarray]]:
-        """The volume from the masks on disk, some of them replaced, and the masks that made it; raises MaskError
-        where they make none."""
+    ) -> tuple[ReflectionVolume, dict[int, np.ndarray], list[int]]:
+        """The volume from the masks on disk, some of them replaced, the masks that made it by view, and the views whose
+        masks show only part of the object, which were left out; raises MaskError where they make none."""
         changed = changed or {}
         masked = [i for i in self.masked_views(reflector) if i not in changed]
         masked += [i for i, mask in changed.items() if mask.any()]
@@ -206,7 +207,10 @@ class MaskStore:
         chosen = [index[v.name] for v in volume_views(self.capture, {self.views[i].name for i in masked})]
         masks = {i: changed[i] if i in changed else self.mask(reflector, i) for i in chosen}
         named = [(self.views[i].name, self.views[i].camera, mask) for i, mask in masks.items()]
-        return volume_from_masks(reflector, named), masks
+        hidden = partly_hidden(named)
+        volume = volume_from_masks(reflector, [m for m in named if m[0] not in hidden])
+        left_out = [index[name] for name in hidden]
+        return volume, {i: mask for i, mask in masks.items() if i not in left_out}, left_out
 
     def save_volume(self, reflector: str) -> dict[str, Any]:
         """Write the volume (and remove an outdated one where the masks make none); returns its `report`. That a file
@@ -235,7 +239,7 @@ class MaskStore:
     ) -> tuple[dict[str, Any], ReflectionVolume | None]:
         empty: dict[str, Any] = {"mesh": None, "outlines": None, "fits": {}, "problem": None}
         try:
-            volume, masks = self.volume(reflector, changed)
+            volume, masks, hidden = self.volume(reflector, changed)
         except MaskError as error:
             blamed = [i for i, view in enumerate(self.views) if view.name in error.views]
             return {**empty, "problem": _problem(error, blamed)}, None
@@ -243,7 +247,19 @@ class MaskStore:
         fits = {i: round(_fit(volume, self.views[i].camera, mask), 3) for i, mask in masks.items()}
         mesh = {"vertices": volume.vertices.round(6).tolist(), "faces": volume.faces.tolist(), "radius": volume.radius}
         polygons = [o.round(1).tolist() for o in outlines]
-        return {**empty, "mesh": mesh, "outlines": polygons, "fits": fits, "problem": self._poor(fits)}, volume
+        problem = self._hidden(hidden) or self._poor(fits)
+        return {**empty, "mesh": mesh, "outlines": polygons, "fits": fits, "problem": problem}, volume
+
+    def _hidden(self, views: list[int]) -> dict[str, Any] | None:
+        if not views:
+            return None
+        names = ", ".join(self.views[i].name for i in views)
+        return {
+            "found": f"Only part of the object is painted in {names}: the other masks agree on more there.",
+            "expected": "masks of the whole object",
+            "remedy": "nothing, where something stands before it (the volume does without); otherwise paint the rest",
+            "views": views,
+        }
 
     def _poor(self, fits: Mapping[int, float]) -> dict[str, Any] | None:
         poor = sorted((i for i in fits if fits[i] < POOR_FIT), key=lambda i: fits[i])
