@@ -6,8 +6,16 @@ import torch
 from scipy.spatial import ConvexHull
 
 from catacaustics.cameras import Camera, pixel_centers
-from catacaustics.geometry import hull_mesh, look_at
-from catacaustics.reflectors.fit import fit_bent_sheet, fit_bowl, fit_ellipsoid, fit_plane, fit_sphere, surroundings
+from catacaustics.geometry import hull_mesh, look_at, normalize
+from catacaustics.reflectors.fit import (
+    fit_bent_sheet,
+    fit_body,
+    fit_bowl,
+    fit_ellipsoid,
+    fit_plane,
+    fit_sphere,
+    surroundings,
+)
 from catacaustics.reflectors.volume import ReflectionVolume, volume_from_masks
 from catacaustics.reflectors.warps import (
     MovedWarp,
@@ -167,6 +175,25 @@ def test_where_no_ellipsoid_fits_its_sphere_is_taken():
     radii = np.linalg.norm(axes, axis=0)
     assert (radii > 0).all()
     assert (radii <= volume.radius * 3).all()
+
+
+@pytest.mark.parametrize("sphere", [True, False])
+def test_the_body_is_found_although_a_spout_stands_out_of_it(sphere):
+    rng = np.random.default_rng(0)
+    center, axes = np.array([0.3, -0.2, 1.0]), np.eye(3) if sphere else np.diag([1.0, 0.7, 1.4])
+    body = center + normalize(rng.normal(size=(700, 3))) @ axes.T
+    spout = center + np.array([1.2, 0.3, 0.2]) + rng.uniform(-0.25, 0.25, (250, 3))
+    points = np.concatenate([body, spout]) + 0.003 * rng.normal(size=(950, 3))
+    found, size = fit_body(points, center + [0.2, 0.1, 0], 1.2 * np.eye(3), sphere)
+    np.testing.assert_allclose(found, center, atol=0.01)
+    np.testing.assert_allclose(np.sort(np.linalg.norm(size, axis=0)), np.sort(np.diag(axes)), rtol=0.02)
+
+
+def test_points_that_lie_on_no_body_leave_the_start_as_it_is():
+    line = np.linspace(-1, 1, 200)[:, None] * np.array([1.0, 0, 0])
+    found, size = fit_body(line, np.zeros(3), np.eye(3), sphere=False)
+    assert np.array_equal(found, np.zeros(3))
+    assert np.array_equal(size, np.eye(3))
 
 
 def test_the_plane_of_a_thin_volume_is_its_face_towards_the_cameras():

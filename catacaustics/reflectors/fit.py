@@ -126,6 +126,45 @@ def fit_ellipsoid(volume: ReflectionVolume) -> tuple[Float[np.ndarray, "3"], Flo
     return center + radius * np.array(shift), radius * vectors * np.sqrt(values)
 
 
+def fit_body(
+    points: Float[np.ndarray, "n 3"],
+    center: Float[np.ndarray, "3"],
+    axes: Float[np.ndarray, "3 3"],
+    sphere: bool,
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]:
+    """Centre and half-axes (columns) of the ellipsoid, or sphere, that most points of a surface lie on: the body of a
+    kettle without its spout, the belly of a vase without its neck.
+
+    Least squares of first-order distances (Taubin 1991) with Cauchy's loss at 3 % of the size.
+
+    Args:
+        points: on the surface of a visual hull.
+        center, axes: to start from; a sphere starts with their mean length.
+    """
+    from scipy.optimize import least_squares
+    from scipy.spatial.transform import Rotation
+
+    lengths = np.linalg.norm(axes, axis=0)
+    size = float(lengths.mean())
+    frame = np.eye(3) if sphere else axes / lengths * np.sign(np.linalg.det(axes))
+
+    def body(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        if sphere:
+            return center + size * x[:3], frame, np.full(3, size * np.exp(x[3]))
+        return center + size * x[:3], Rotation.from_rotvec(x[3:6]).as_matrix() @ frame, lengths * np.exp(x[6:])
+
+    def distances(x: np.ndarray) -> np.ndarray:
+        middle, rotation, radii = body(x)
+        scaled = (points - middle) @ rotation / radii
+        norms = np.linalg.norm(scaled, axis=1)
+        return (norms - 1) * norms / np.maximum(np.linalg.norm(scaled / radii, axis=1), 1e-9) / size
+
+    answer = least_squares(distances, np.zeros(4 if sphere else 9), loss="cauchy", f_scale=0.03, max_nfev=100)
+    middle, rotation, radii = body(answer.x)
+    believed = np.isfinite(answer.x).all() and 0.2 < radii.min() / size and radii.max() / size < 3
+    return (middle, rotation * radii) if believed else (center, axes)
+
+
 def fit_bent_sheet(volume: ReflectionVolume) -> list[tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"]]]:
     """Cylinders, as long ellipsoids (centre and half-axes in columns), for a sheet that is bent about either of its
     long directions; none for a volume that is not flat.

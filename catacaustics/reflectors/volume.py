@@ -417,7 +417,9 @@ def _most_hidden(masks: list[tuple[str, Camera, np.ndarray]], volume: Reflection
         rest = ~outside[apart[i]].any(0)
         with_it = rest & ~outside[i]
         witnesses = [masks[j][1:] for j in np.flatnonzero(apart[i])]
-        losses = sorted(1 - _picture_area(points[with_it], *w) / max(_picture_area(points[rest], *w), 1.0) for w in witnesses)
+        losses = sorted(
+            1 - _picture_area(points[with_it], *w) / max(_picture_area(points[rest], *w), 1.0) for w in witnesses
+        )
         if losses[-2] > _LOSS:
             return int(i)
     return None

@@ -12,7 +12,15 @@ from catacaustics.config import SplatConfig, TrainConfig
 from catacaustics.environment import EnvironmentMap
 from catacaustics.errors import UserError
 from catacaustics.losses import dssim
-from catacaustics.reflectors.fit import fit_bent_sheet, fit_bowl, fit_ellipsoid, fit_plane, fit_sphere, surroundings
+from catacaustics.reflectors.fit import (
+    fit_bent_sheet,
+    fit_body,
+    fit_bowl,
+    fit_ellipsoid,
+    fit_plane,
+    fit_sphere,
+    surroundings,
+)
 from catacaustics.reflectors.visual_hull import sample_visual_hull
 from catacaustics.reflectors.volume import ReflectionVolume, volume_masks
 from catacaustics.reflectors.warps import (
@@ -97,14 +105,21 @@ def neighbor_footprints(positions: Float[np.ndarray, "n 3"]) -> Float[np.ndarray
 
 def usual_points(capture: Capture, volumes: list[ReflectionVolume], config: TrainConfig) -> dict[str, int]:
     """Points that images of the training's size deserve: 1.3 primary points a pixel of one image, 2 reflection points a
-    pixel of the largest reflector (medians over the views). Measured on path-traced rooms; more brings little."""
+    pixel of the largest reflector. Measured on path-traced rooms; more brings little."""
     cameras = [scaled_camera(v.camera, config.image_size, 1.0) for v in capture.train]
     pixels = float(np.median([c.width * c.height for c in cameras]))
-    areas = [np.median([v.project_mask(c).sum() for c in cameras[:: max(1, len(cameras) // 9)]]) for v in volumes]
+    share = max((_image_share(v, capture) for v in volumes), default=0)
     return {
         "primary_points": int(np.clip(1.3 * pixels, 1000, config.max_primary_points)),
-        "reflection_points": int(np.clip(2 * max(areas, default=0), 500, 400_000)),
+        "reflection_points": int(np.clip(2 * pixels * share, 500, 400_000)),
     }
+
+
+def _image_share(volume: ReflectionVolume, capture: Capture) -> float:
+    """Share of the image that a volume takes: the median over the training views that see it well."""
+    views = capture.train[:: max(1, len(capture.train) // 24)]
+    shares = np.array([volume.project_mask(scaled_camera(v.camera, 160, 1.0)).mean() for v in views])
+    return float(np.median(shares[shares >= 0.1 * shares.max()]))
 
 
 def mean_reflector_color(capture: Capture, volume: ReflectionVolume) -> Float[np.ndarray, "3"]:
@@ -121,16 +136,16 @@ def primary_seeds(capture: Capture, reflectors: list[Reflector], count: int, rng
     """At most `count` stereo points outside the reflectors, and points on the reflectors' surfaces, which carry rho, in
     random order.
 
-    Stereo has no points on a mirror, but something must hide what is behind it.
+    Stereo has no points on a mirror, but something must hide what is behind it, and a glaze has paint below it. A
+    surface gets as many points as the image has for its share, a quarter as dense: its sides are four pictures wide.
     """
     cloud = capture.points()
     for volume, _ in reflectors:
         cloud = cloud.select(~volume.contains(cloud.positions.astype(np.float64)))
     if len(cloud) > count:
         cloud = cloud.select(rng.choice(len(cloud), count, replace=False))
-    spacing2 = 2 * float(np.median(neighbor_footprints(cloud.positions))) if len(cloud) > 1 else 1e-4
     budget = int(_SURFACE_SHARE * count)
-    wanted = [int(volume.area / spacing2) + 1 for volume, _ in reflectors]
+    wanted = [int(count * _image_share(volume, capture)) + 1 for volume, _ in reflectors]
     shrink = min(1.0, budget / max(sum(wanted), 1))
     parts = [(cloud.positions, cloud.normals, cloud.colors, np.full(len(cloud), 0.02))]
     for (volume, model), n in zip(reflectors, wanted, strict=True):
@@ -301,8 +316,8 @@ def seen_through(
 
 
 def start_shapes(scene: Scene, capture: Capture, config: TrainConfig) -> None:
-    """Fit every quadric and plane to the photographs while everything else stands still, quadrics from several sizes;
-    the best remains.
+    """Fit every quadric and plane to the photographs while everything else stands still, quadrics from several sizes
+    and from the body in the visual hull; the best remains.
 
     A volume from few or careless masks is too large, a convex hull has handles and spouts in it, and a flat one tells
     little of how it is bent; training does not find back from far. The surroundings are known in outline, so that a
@@ -318,7 +333,7 @@ def start_shapes(scene: Scene, capture: Capture, config: TrainConfig) -> None:
                 boxes = [_middle_box(volume.scaled(0.6), camera) for _, camera in cameras]
                 seen = [(v, c, box) for (v, c), box in zip(cameras, boxes, strict=True) if box is not None]
                 if seen:
-                    _start_shape(scene, capture, mirror, _starts(mirror, volume), seen)
+                    _start_shape(scene, capture, mirror, _starts(mirror, volume, capture), seen)
 
 
 def _start_shape(
@@ -366,16 +381,21 @@ def _start_shape(
             tensor.copy_(value)
 
 
-def _starts(mirror: QuadricWarp | PlaneWarp, volume: ReflectionVolume) -> list[list[torch.Tensor]]:
-    """Buffers of a mirror to start from: as it is; convex ones smaller too, or bent sheets where the volume is flat."""
+def _starts(mirror: QuadricWarp | PlaneWarp, volume: ReflectionVolume, capture: Capture) -> list[list[torch.Tensor]]:
+    """Buffers of a mirror to start from: as it is; convex ones smaller too and as the body in the visual hull, or bent
+    sheets where the volume is flat."""
     start = [b.clone() for b in mirror.buffers()]
     if isinstance(mirror, PlaneWarp) or mirror.concave:
         return [start]
-    sheets = [] if len(mirror.log_radii) == 1 else fit_bent_sheet(volume)
     center, axes, concave = start
-    if sheets:
-        return [start, *([torch.from_numpy(c).to(center), torch.from_numpy(a).to(axes), concave] for c, a in sheets)]
-    return [[center, size * axes, concave] for size in _SIZES]
+    sphere = len(mirror.log_radii) == 1
+    found = [] if sphere else fit_bent_sheet(volume)
+    sizes = (1.0,) if found else _SIZES
+    if not found:
+        points = sample_visual_hull(volume, volume_masks(capture, volume.name), 2000, np.random.default_rng(0))[0]
+        found = [fit_body(points, *(t.cpu().numpy().astype(float) for t in (center, axes)), sphere)]
+    others = [[torch.from_numpy(c).to(center), torch.from_numpy(a).to(axes), concave] for c, a in found]
+    return [[center, size * axes, concave] for size in sizes] + others
 
 
 def _middle_box(core: ReflectionVolume, camera: Camera) -> Viewport | None:
