@@ -161,7 +161,7 @@ def fit_body(
 
     answer = least_squares(distances, np.zeros(4 if sphere else 9), loss="cauchy", f_scale=0.03, max_nfev=100)
     middle, rotation, radii = body(answer.x)
-    believed = np.isfinite(answer.x).all() and 0.2 < radii.min() / size and radii.max() / size < 3
+    believed = np.isfinite(answer.x).all() and radii.min() > 0.2 * size and radii.max() < 3 * size
     return (middle, rotation * radii) if believed else (center, axes)
 
 

@@ -415,11 +415,9 @@ def _most_hidden(masks: list[tuple[str, Camera, np.ndarray]], volume: Reflection
         if shares[i] >= _SHOWN:
             return None
         rest = ~outside[apart[i]].any(0)
-        with_it = rest & ~outside[i]
+        kept = points[rest & ~outside[i]]
         witnesses = [masks[j][1:] for j in np.flatnonzero(apart[i])]
-        losses = sorted(
-            1 - _picture_area(points[with_it], *w) / max(_picture_area(points[rest], *w), 1.0) for w in witnesses
-        )
+        losses = sorted(1 - _picture_area(kept, *w) / max(_picture_area(points[rest], *w), 1.0) for w in witnesses)
         if losses[-2] > _LOSS:
             return int(i)
     return None
