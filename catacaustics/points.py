@@ -26,6 +26,11 @@ class PointCloud:
         """The points chosen by a boolean mask or an index array."""
         return PointCloud(self.positions[index], self.normals[index], self.colors[index])
 
+    def joined(self, other: "PointCloud") -> "PointCloud":
+        """The points of both clouds."""
+        pairs = ((self.positions, other.positions), (self.normals, other.normals), (self.colors, other.colors))
+        return PointCloud(*(np.concatenate(pair) for pair in pairs))
+
 
 def write_ply(path: Path, cloud: PointCloud) -> None:
     """Write binary PLY with x y z nx ny nz (float32) and red green blue (8 bits)."""

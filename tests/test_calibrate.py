@@ -22,11 +22,11 @@ sys.path.insert(0, str(Path(__file__).parent.parent / "tools"))
 from compare_cameras import compare
 
 
-def no_stereo(capture: Capture, max_size: int, sparse_points: np.ndarray | None) -> PointCloud:
+def no_stereo(capture: Capture, max_size: int, sparse_points: np.ndarray | None) -> tuple[PointCloud, PointCloud]:
     """Multi-view stereo has its own tests; here one point stands in for it."""
     assert sparse_points is None or len(sparse_points) > 0
     up = np.array([[0, 0, 1]], np.float32)
-    return PointCloud(up, up, up)
+    return PointCloud(up, up, up), PointCloud(up[:0], up[:0], up[:0])
 
 
 def world_from_camera(folder: Path) -> dict[str, np.ndarray]:

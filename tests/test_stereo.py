@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy.spatial import KDTree
 
 from catacaustics.cameras import Camera, pixel_centers
 from catacaustics.capture import fusion, stereo
@@ -233,7 +234,7 @@ def ring_capture(root: Path, shade=texture, count: int = 8) -> Capture:
 @pytest.fixture(scope="module")
 def fused(tmp_path_factory):
     capture = ring_capture(tmp_path_factory.mktemp("ring"))
-    return capture, stereo.fuse_capture(capture)
+    return capture, stereo.fuse_capture(capture)[0]
 
 
 def surface_distance(points):
@@ -287,7 +288,7 @@ def test_finished_views_are_skipped_and_only_a_missing_one_is_made_again(fused):
     content = lost.read_bytes()
     before = {path: path.stat().st_mtime_ns for path in folder.iterdir()}
     lost.unlink()
-    again = stereo.fuse_capture(capture)
+    again, _ = stereo.fuse_capture(capture)
     after = {path: path.stat().st_mtime_ns for path in folder.iterdir()}
     assert {path for path in before if before[path] != after[path]} == {lost}
     assert lost.read_bytes() == content
@@ -302,13 +303,15 @@ def test_masked_pixels_yield_no_points(fused):
         mask = np.isfinite(render(view.camera, [sphere((0, 0, 0.5), 0.5)])[1])
         write_image(capture.mask_path(view, "ball"), mask)
     try:
-        masked = stereo.fuse_capture(open_capture(capture.root))
+        masked, guesses = stereo.fuse_capture(open_capture(capture.root))
     finally:
         for path in (capture.root / "masks" / "ball" / "arc").iterdir():
             path.unlink()
-    radius = np.linalg.norm(masked.positions - [0, 0, 0.5], axis=1)
     assert len(masked) > 500
-    assert ((radius < 0.51) & (masked.positions[:, 2] > 0.1)).sum() == 0
+    assert len(guesses) > 100
+    for points in (masked.positions, guesses.positions):
+        radius = np.linalg.norm(points - [0, 0, 0.5], axis=1)
+        assert ((radius < 0.51) & (points[:, 2] > 0.1)).sum() == 0
 
 
 def fuse_exact_maps(folder: Path, normal, scales=(1, 1, 1, 1, 1)) -> PointCloud:
@@ -324,6 +327,29 @@ def fuse_exact_maps(folder: Path, normal, scales=(1, 1, 1, 1, 1)) -> PointCloud:
         points.append(camera.unproject(pixel_centers(camera.viewport)[::20, ::20], depth[::20, ::20]).reshape(-1, 3))
     fusion.write_overlap_model(folder, [(f"{i}.png", c) for i, c in enumerate(cameras)], np.concatenate(points))
     return fusion.fuse_maps(folder, "photometric", 3, 0.01, 20.0)
+
+
+def test_guesses_cover_surfaces_that_the_cloud_leaves_open(fused):
+    capture, cloud = fused
+    again, guesses = stereo.fuse_capture(capture)
+    np.testing.assert_array_equal(again.positions, cloud.positions)
+    surfaces = [sphere((0, 0, 0.5), 0.5), plane((0, 0, 1), 0.0), plane((0, 1, 0), 1.5)]
+    pixels = pixel_centers(capture.train[0].camera.viewport)
+    seen = [v.camera.unproject(pixels, render(v.camera, surfaces)[1]).reshape(-1, 3) for v in capture.train]
+    seen = np.concatenate([points[np.isfinite(points).all(1)] for points in seen])
+    open_before, open_after = (
+        (KDTree(points).query(seen)[0] > 0.08).mean() for points in (cloud.positions, cloud.joined(guesses).positions)
+    )
+    assert open_after < open_before
+
+
+def test_holes_of_a_cloud_are_filled_and_its_own_points_stay_first():
+    grid = np.stack(np.meshgrid(np.arange(20.0), np.arange(20.0), [0.0]), -1).reshape(-1, 3).astype(np.float32)
+    cloud = PointCloud(grid[grid[:, 0] < 10], *(2 * [grid[grid[:, 0] < 10]]))
+    filled = fusion.fill_holes(cloud, PointCloud(grid, grid, grid))
+    np.testing.assert_array_equal(filled.positions[: len(cloud)], cloud.positions)
+    assert filled.positions[len(cloud) :, 0].min() > 10
+    assert filled.positions[:, 0].max() == 19
 
 
 def test_fusion_of_exact_maps_returns_the_surface(tmp_path):
@@ -378,7 +404,7 @@ def test_sparse_points_take_the_place_of_the_search_for_depth(tmp_path):
     points = np.concatenate(
         [rng.uniform(-1, 1, (300, 3)) * [1, 1, 0], normalize(rng.normal(size=(300, 3))) / 2 + 0.5 * UP]
     )
-    cloud = stereo.fuse_capture(capture, sparse_points=points)
+    cloud, _ = stereo.fuse_capture(capture, sparse_points=points)
     assert not any((capture.root / "work" / "stereo").rglob("coarse"))
     assert (surface_distance(cloud.positions) < 0.03).mean() > 0.95
 

@@ -359,13 +359,15 @@ def _read_solution(work: Path) -> _Solution:
 def _fuse(
     capture: Capture, config: CalibrateConfig, stages: Stages, inputs: list[Any], points: np.ndarray | None = None
 ) -> None:
-    """Multi-view stereo into points.ply."""
+    """Multi-view stereo into points.ply and guesses.ply."""
 
     def fuse() -> str:
         from catacaustics.capture.stereo import fuse_capture
 
-        cloud = fuse_capture(capture, config.stereo_size, points)
-        write_ply(capture.root / "points.ply", cloud)
-        return f"{len(cloud)} points with normals"
+        cloud, guesses = fuse_capture(capture, config.stereo_size, points)
+        write_ply(files[0], cloud)
+        write_ply(files[1], guesses)
+        return f"{len(cloud)} points with normals, and {len(guesses)} guesses where there are none"
 
-    stages.run("points", [inputs, config.stereo_size], [capture.root / "points.ply"], fuse)
+    files = [capture.root / "points.ply", capture.root / "guesses.ply"]
+    stages.run("points", [inputs, config.stereo_size], files, fuse)

@@ -175,6 +175,19 @@ def remove_contradicted(
     return cloud.select(balance >= 0)
 
 
+def fill_holes(cloud: PointCloud, others: PointCloud, reach: float = 2.0) -> PointCloud:
+    """A cloud and, after its points, those of another one that lie where it has none: farther from its nearest point
+    than `reach` times that point's distance to its 8th neighbour."""
+    from scipy.spatial import KDTree
+
+    if len(cloud) <= 8 or not len(others):
+        return cloud
+    tree = KDTree(cloud.positions)
+    distance, nearest = tree.query(others.positions)
+    spacing = tree.query(cloud.positions[nearest], 9)[0][:, 8]
+    return cloud.joined(others.select(distance > reach * spacing))
+
+
 def remove_outliers(cloud: PointCloud, neighbors: int = 20, deviations: float = 2.0) -> PointCloud:
     """Drop points that lie farther from their nearest neighbours than is usual: Open3D's statistical outliers.
 

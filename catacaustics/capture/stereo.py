@@ -22,6 +22,7 @@ from tqdm import tqdm
 from catacaustics.cameras import Camera, pixel_centers
 from catacaustics.capture.dataset import Capture
 from catacaustics.capture.fusion import (
+    fill_holes,
     fuse_maps,
     import_pycolmap,
     in_frame,
@@ -64,9 +65,10 @@ MASK_MARGIN = 3
 
 def fuse_capture(
     capture: Capture, max_size: int = 800, sparse_points: Float[np.ndarray, "n 3"] | None = None
-) -> PointCloud:
-    """Dense points with normals and colours from a capture's training views. Reflector masks, where there are any, are
-    left out: what is seen there is not where it seems.
+) -> tuple[PointCloud, PointCloud]:
+    """Dense points with normals and colours from a capture's training views, and guesses where there are none: what
+    fewer views say than it takes to be sure. Reflector masks, where there are any, are left out: what is seen there is
+    not where it seems.
 
     Args:
         max_size: longer side in pixels of the images that are matched.
@@ -93,15 +95,22 @@ def fuse_capture(
         kind = "photometric"
     stereo.write_masks()
     min_views = min(MIN_VIEWS, len(capture.train))
-    cloud = fuse_maps(stereo.folder, kind, min_views, MAX_DEPTH_ERROR, MAX_NORMAL_ERROR)
-    cloud = remove_outliers(remove_contradicted(cloud, stereo.folder, kind, stereo.named_cameras))
+
+    def fused(views: int) -> PointCloud:
+        cloud = fuse_maps(stereo.folder, kind, views, MAX_DEPTH_ERROR, MAX_NORMAL_ERROR)
+        return remove_outliers(remove_contradicted(cloud, stereo.folder, kind, stereo.named_cameras))
+
+    cloud = fused(min_views)
     if not len(cloud):
         raise UserError(
             f"Multi-view stereo on {capture.root} left no points: no {min_views} views agree on any surface.",
             "photographs that overlap well (every part in 4 or more, 5 to 20 degrees apart) with textured surfaces",
             "take more photographs, or check the calibration and the masks (white = reflector, left out)",
         )
-    return cloud
+    filled = cloud
+    for views in range(min_views - 1, 0, -1):
+        filled = fill_holes(filled, fused(views))
+    return cloud, filled.select(np.arange(len(cloud), len(filled)))
 
 
 class _Stereo:

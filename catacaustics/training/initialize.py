@@ -139,7 +139,7 @@ def primary_seeds(capture: Capture, reflectors: list[Reflector], count: int, rng
     Stereo has no points on a mirror, but something must hide what is behind it, and a glaze has paint below it. A
     surface gets as many points as the image has for its share, a quarter as dense: its sides are four pictures wide.
     """
-    cloud = capture.points()
+    cloud = capture.points_and_guesses()
     for volume, _ in reflectors:
         cloud = cloud.select(~volume.contains(cloud.positions.astype(np.float64)))
     if len(cloud) > count:
