@@ -11,7 +11,7 @@ from catacaustics.capture.dataset import open_capture
 from catacaustics.config import TrainConfig
 from catacaustics.errors import UserError
 from catacaustics.reflectors.volume import ReflectionVolume, build_volume
-from catacaustics.training import initialize, selection
+from catacaustics.training import mirrors, selection
 from catacaustics.training.initialize import named_reflectors
 from catacaustics.training.selection import LADDER, LEAST_GAIN, Trial, best, choose_models, finalists, gain
 from catacaustics.training.train import train
@@ -57,7 +57,7 @@ def chosen(tmp_path_factory):
     config = TrainConfig(
         capture, root / "run", iterations=10, image_size=64, environment_width=20, warp_width=16, refine_poses=False
     )
-    with mock.patch.object(initialize, "_SHAPE_STEPS", 3):
+    with mock.patch.object(mirrors, "_SHAPE_STEPS", 3):
         train(config)
     return config, json.loads((root / "run" / "model_choice.json").read_text())
 

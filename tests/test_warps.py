@@ -26,6 +26,7 @@ from catacaustics.reflectors.warps import (
     StaticWarp,
     warp_from_state,
 )
+from catacaustics.training.mirrors import off_body
 
 CENTER = torch.tensor([0.2, -0.1, 0.4])
 
@@ -290,3 +291,19 @@ def test_a_reflector_moved_with_its_surroundings_shows_the_moved_image():
         again = warp_from_state(MovedWarp(warp, scale, turn, shift).state_dict())
         assert isinstance(again, MovedWarp)
         assert type(again.warp) is type(warp)
+
+
+def test_the_distance_from_a_body_is_that_of_its_fit_and_its_gradient_moves_a_shape_onto_the_points():
+    rng = np.random.default_rng(0)
+    points = torch.from_numpy(normalize(rng.normal(size=(500, 3))) * [1.0, 0.8, 1.3])
+    center = torch.tensor([0.03, 0, -0.02], dtype=torch.float64, requires_grad=True)
+    radii = torch.tensor([1.03, 0.82, 1.28], dtype=torch.float64, requires_grad=True)
+    assert off_body(points, torch.zeros(3).double(), torch.diag(torch.tensor([1.0, 0.8, 1.3]).double())) < 1e-8
+    assert torch.autograd.gradcheck(lambda c, r: off_body(points, c, torch.diag(r)), (center, radii))
+    optimizer = torch.optim.Adam([center, radii], 2e-3)
+    for _ in range(100):
+        optimizer.zero_grad()
+        off_body(points, center, torch.diag(radii)).backward()
+        optimizer.step()
+    np.testing.assert_allclose(center.detach(), 0, atol=3e-3)
+    np.testing.assert_allclose(radii.detach(), [1.0, 0.8, 1.3], atol=3e-3)

@@ -14,6 +14,8 @@ _FLAT = 0.1
 """A volume thinner than this share of its length is a plate as it is."""
 _PLANES = 150
 """Bounding planes that a mirror's plane is fitted to, at most: a round body of many masks has ten times as many."""
+BODY_SCALE = 0.03
+"""Of the size of a body: points farther from it belong to something else."""
 _THINNEST = 0.1
 """A fitted radius below this share of the largest one is not believed."""
 
@@ -135,23 +137,23 @@ def fit_body(
     """Centre and half-axes (columns) of the ellipsoid, or sphere, that most points of a surface lie on: the body of a
     kettle without its spout, the belly of a vase without its neck.
 
-    Least squares of first-order distances (Taubin 1991) with Cauchy's loss at 3 % of the size.
+    Least squares of first-order distances (Taubin 1991) with Cauchy's loss at 3 % of the size, from three sizes.
 
     Args:
         points: on the surface of a visual hull.
-        center, axes: to start from; a sphere starts with their mean length.
+        center, axes: of the largest size to start from; a sphere starts with their mean length.
     """
     from scipy.optimize import least_squares
     from scipy.spatial.transform import Rotation
 
-    lengths = np.linalg.norm(axes, axis=0)
-    size = float(lengths.mean())
-    frame = np.eye(3) if sphere else axes / lengths * np.sign(np.linalg.det(axes))
+    start = np.linalg.norm(axes, axis=0)
+    size = float(start.mean())
+    frame = np.eye(3) if sphere else axes / start * np.sign(np.linalg.det(axes))
 
     def body(x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         if sphere:
             return center + size * x[:3], frame, np.full(3, size * np.exp(x[3]))
-        return center + size * x[:3], Rotation.from_rotvec(x[3:6]).as_matrix() @ frame, lengths * np.exp(x[6:])
+        return center + size * x[:3], Rotation.from_rotvec(x[3:6]).as_matrix() @ frame, start * np.exp(x[6:])
 
     def distances(x: np.ndarray) -> np.ndarray:
         middle, rotation, radii = body(x)
@@ -159,7 +161,9 @@ def fit_body(
         norms = np.linalg.norm(scaled, axis=1)
         return (norms - 1) * norms / np.maximum(np.linalg.norm(scaled / radii, axis=1), 1e-9) / size
 
-    answer = least_squares(distances, np.zeros(4 if sphere else 9), loss="cauchy", f_scale=0.03, max_nfev=100)
+    starts = [np.r_[np.zeros(3 if sphere else 6), np.full(1 if sphere else 3, np.log(f))] for f in (1, 0.8, 0.6)]
+    answers = [least_squares(distances, x, loss="cauchy", f_scale=BODY_SCALE, max_nfev=100) for x in starts]
+    answer = min(answers, key=lambda a: a.cost)
     middle, rotation, radii = body(answer.x)
     believed = np.isfinite(answer.x).all() and radii.min() > 0.2 * size and radii.max() < 3 * size
     return (middle, rotation * radii) if believed else (center, axes)

@@ -6,21 +6,12 @@ import numpy as np
 import torch
 from torch import nn
 
-from catacaustics.cameras import Camera, Viewport, up_direction
-from catacaustics.capture.dataset import Capture, View
+from catacaustics.cameras import up_direction
+from catacaustics.capture.dataset import Capture
 from catacaustics.config import SplatConfig, TrainConfig
 from catacaustics.environment import EnvironmentMap
 from catacaustics.errors import UserError
-from catacaustics.losses import dssim
-from catacaustics.reflectors.fit import (
-    fit_bent_sheet,
-    fit_body,
-    fit_bowl,
-    fit_ellipsoid,
-    fit_plane,
-    fit_sphere,
-    surroundings,
-)
+from catacaustics.reflectors.fit import fit_bowl, fit_ellipsoid, fit_plane, fit_sphere, surroundings
 from catacaustics.reflectors.visual_hull import sample_visual_hull
 from catacaustics.reflectors.volume import ReflectionVolume, volume_masks
 from catacaustics.reflectors.warps import (
@@ -32,15 +23,12 @@ from catacaustics.reflectors.warps import (
     learns_positions,
 )
 from catacaustics.renderer import FEATURES, NeuralRenderer
-from catacaustics.scene import PointParameters, Scene, frozen
+from catacaustics.scene import PointParameters, Scene
 from catacaustics.shapes import Float
+from catacaustics.training.mirrors import start_shapes
 from catacaustics.training.photographs import photograph, scaled_camera
 
 INITIAL_OPACITY = 0.8
-_SIZES = (1.0, 0.8, 0.65)
-"""Sizes that a quadric is fitted from, in units of the one that touches its volume."""
-_SHAPE_STEPS, _SHAPE_SIZE = 30, 120
-"""Steps of each fit, and the longer side of its images."""
 _SHAPE_SHARE = 1 / 6
 """Of the clouds, for the fits: what sparser ones show is a blur that prefers flat mirrors."""
 _PLAIN_SHARE = 0.75
@@ -313,98 +301,6 @@ def seen_through(
         parts.append((layers.directions.view(-1, 3), colors, weights.reshape(-1)))
     directions, colors, weights = (torch.cat(p) for p in zip(*parts, strict=True))
     return directions, colors, weights
-
-
-def start_shapes(scene: Scene, capture: Capture, config: TrainConfig) -> None:
-    """Fit every quadric and plane to the photographs while everything else stands still, quadrics from several sizes
-    and from the body in the visual hull; the best remains.
-
-    A volume from few or careless masks is too large, a convex hull has handles and spouts in it, and a flat one tells
-    little of how it is bent; training does not find back from far. The surroundings are known in outline, so that a
-    mirror of the right shape shows about the right picture. Judged in the middle of the volume, which is mirror in any
-    case.
-    """
-    cameras = [(v, scaled_camera(v.camera, min(_SHAPE_SIZE, config.image_size), 1.0)) for v in capture.train]
-    cameras = cameras[:: max(1, len(cameras) // 10)]
-    with frozen(scene):
-        for warp, volume in zip(scene.warps, scene.volumes, strict=True):
-            mirror = warp.quadric if isinstance(warp, QuadricNeuralWarp) else warp
-            if isinstance(mirror, QuadricWarp | PlaneWarp):
-                boxes = [_middle_box(volume.scaled(0.6), camera) for _, camera in cameras]
-                seen = [(v, c, box) for (v, c), box in zip(cameras, boxes, strict=True) if box is not None]
-                if seen:
-                    _start_shape(scene, capture, mirror, _starts(mirror, volume, capture), seen)
-
-
-def _start_shape(
-    scene: Scene,
-    capture: Capture,
-    mirror: QuadricWarp | PlaneWarp,
-    starts: list[list[torch.Tensor]],
-    cameras: list[tuple[View, Camera, Viewport]],
-) -> None:
-    parameters = list(mirror.parameters())
-    targets = []
-    for view, camera, box in cameras:
-        photo = photograph(capture, view, camera)
-        photo = photo[box.y0 : box.y0 + box.height, box.x0 : box.x0 + box.width]
-        targets.append(torch.from_numpy(np.ascontiguousarray(photo)).to(scene.device))
-
-    def error(i: int) -> torch.Tensor:
-        image = scene.decode(scene.layers(cameras[i][1], cameras[i][2]))
-        return (image - targets[i]).abs().mean() + dssim(image, targets[i])
-
-    found = []
-    for start in starts:
-        with torch.no_grad():
-            for buffer, value in zip(mirror.buffers(), start, strict=True):
-                buffer.copy_(value)
-            for parameter in parameters:
-                parameter.zero_()
-        for parameter in parameters:
-            parameter.requires_grad_(True)
-        optimizer = torch.optim.Adam(parameters, 0.02)
-        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, _SHAPE_STEPS, 1e-3)
-        for step in range(_SHAPE_STEPS):
-            optimizer.zero_grad()
-            error(step % len(cameras)).backward()
-            optimizer.step()
-            schedule.step()
-        for parameter in parameters:
-            parameter.requires_grad_(False)
-        total = float(sum(float(error(i)) for i in range(len(cameras))))
-        state = [t.detach().clone() for t in (*mirror.buffers(), *parameters)]
-        found.append((total if np.isfinite(total) else np.inf, state))
-    best = min(found, key=lambda pair: pair[0])[1]
-    with torch.no_grad():
-        for tensor, value in zip((*mirror.buffers(), *parameters), best, strict=True):
-            tensor.copy_(value)
-
-
-def _starts(mirror: QuadricWarp | PlaneWarp, volume: ReflectionVolume, capture: Capture) -> list[list[torch.Tensor]]:
-    """Buffers of a mirror to start from: as it is; convex ones smaller too and as the body in the visual hull, or bent
-    sheets where the volume is flat."""
-    start = [b.clone() for b in mirror.buffers()]
-    if isinstance(mirror, PlaneWarp) or mirror.concave:
-        return [start]
-    center, axes, concave = start
-    sphere = len(mirror.log_radii) == 1
-    found = [] if sphere else fit_bent_sheet(volume)
-    sizes = (1.0,) if found else _SIZES
-    if not found:
-        points = sample_visual_hull(volume, volume_masks(capture, volume.name), 2000, np.random.default_rng(0))[0]
-        found = [fit_body(points, *(t.cpu().numpy().astype(float) for t in (center, axes)), sphere)]
-    others = [[torch.from_numpy(c).to(center), torch.from_numpy(a).to(axes), concave] for c, a in found]
-    return [[center, size * axes, concave] for size in sizes] + others
-
-
-def _middle_box(core: ReflectionVolume, camera: Camera) -> Viewport | None:
-    """The box around a volume in a view; None where it is not seen."""
-    rows, columns = np.nonzero(core.project_mask(camera))
-    if not len(rows):
-        return None
-    x0, y0 = int(columns.min()), int(rows.min())
-    return Viewport(x0, y0, int(columns.max()) - x0 + 1, int(rows.max()) - y0 + 1)
 
 
 def stage_count(seeds: Seeds, share: float) -> int:

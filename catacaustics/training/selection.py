@@ -190,9 +190,8 @@ def _hurried(config: TrainConfig) -> bool:
 
 
 def _steps(config: TrainConfig) -> int:
-    if config.minutes is None or not _hurried(config):
-        return _STEPS
-    return max(_LEAST_STEPS, round(_STEPS * config.minutes / _PATIENT))
+    share = 1.0 if config.minutes is None else min(1.0, config.minutes / _PATIENT)
+    return max(_LEAST_STEPS, round(_STEPS * share))
 
 
 def _filled(reflectors: list, rung: str) -> tuple[str, ...]:

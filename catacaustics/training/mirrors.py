@@ -1,0 +1,147 @@
+"""The shapes of mirrors before training: fitted to the photographs and to the visual hull of the masks."""
+
+import numpy as np
+import torch
+
+from catacaustics.cameras import Camera, Viewport
+from catacaustics.capture.dataset import Capture, View
+from catacaustics.config import TrainConfig
+from catacaustics.losses import dssim
+from catacaustics.reflectors.fit import BODY_SCALE, fit_bent_sheet, fit_body
+from catacaustics.reflectors.visual_hull import sample_visual_hull
+from catacaustics.reflectors.volume import ReflectionVolume, volume_masks
+from catacaustics.reflectors.warps import PlaneWarp, QuadricNeuralWarp, QuadricWarp
+from catacaustics.scene import Scene, frozen
+from catacaustics.shapes import Float
+from catacaustics.training.photographs import photograph, scaled_camera
+
+_SIZES = (1.0, 0.8, 0.65)
+"""Sizes that a quadric is fitted from, in units of the one that touches its volume."""
+_SHAPE_STEPS, _SHAPE_SIZE = 30, 120
+"""Steps of each fit, and the longer side of its images."""
+_BODY_WEIGHT = 0.1
+"""Of the distance from the visual hull beside the photographs, which say little of a painted mirror's shape."""
+
+
+def start_shapes(scene: Scene, capture: Capture, config: TrainConfig) -> None:
+    """Fit every quadric and plane to the photographs while everything else stands still, quadrics from several sizes
+    and from the body in the visual hull; the best remains.
+
+    A volume from few or careless masks is too large, a convex hull has handles and spouts in it, and a flat one tells
+    little of how it is bent; training does not find back from far. The surroundings are known in outline, so that a
+    mirror of the right shape shows about the right picture; where paint shows more, the visual hull keeps the shape.
+    Judged in the middle of the volume, which is mirror in any case.
+    """
+    cameras = [(v, scaled_camera(v.camera, min(_SHAPE_SIZE, config.image_size), 1.0)) for v in capture.train]
+    cameras = cameras[:: max(1, len(cameras) // 10)]
+    with frozen(scene):
+        for warp, volume in zip(scene.warps, scene.volumes, strict=True):
+            mirror = warp.quadric if isinstance(warp, QuadricNeuralWarp) else warp
+            if isinstance(mirror, QuadricWarp | PlaneWarp):
+                body = _body_points(mirror, volume, capture)
+                boxes = [_middle_box(volume.scaled(0.6), camera) for _, camera in cameras]
+                seen = [(v, c, box) for (v, c), box in zip(cameras, boxes, strict=True) if box is not None]
+                if seen:
+                    _start_shape(scene, capture, mirror, _starts(mirror, volume, body), seen, body)
+
+
+def _start_shape(
+    scene: Scene,
+    capture: Capture,
+    mirror: QuadricWarp | PlaneWarp,
+    starts: list[list[torch.Tensor]],
+    cameras: list[tuple[View, Camera, Viewport]],
+    body: torch.Tensor | None,
+) -> None:
+    parameters = list(mirror.parameters())
+    targets = []
+    for view, camera, box in cameras:
+        photo = photograph(capture, view, camera)
+        photo = photo[box.y0 : box.y0 + box.height, box.x0 : box.x0 + box.width]
+        targets.append(torch.from_numpy(np.ascontiguousarray(photo)).to(scene.device))
+
+    def error(i: int) -> torch.Tensor:
+        image = scene.decode(scene.layers(cameras[i][1], cameras[i][2]))
+        shown = (image - targets[i]).abs().mean() + dssim(image, targets[i])
+        if body is None or isinstance(mirror, PlaneWarp):
+            return shown
+        return shown + _BODY_WEIGHT * off_body(body, *mirror.shape())
+
+    found = []
+    for start in starts:
+        with torch.no_grad():
+            for buffer, value in zip(mirror.buffers(), start, strict=True):
+                buffer.copy_(value)
+            for parameter in parameters:
+                parameter.zero_()
+        for parameter in parameters:
+            parameter.requires_grad_(True)
+        optimizer = torch.optim.Adam(parameters, 0.02)
+        schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, _SHAPE_STEPS, 1e-3)
+        for step in range(_SHAPE_STEPS):
+            optimizer.zero_grad()
+            error(step % len(cameras)).backward()
+            optimizer.step()
+            schedule.step()
+        for parameter in parameters:
+            parameter.requires_grad_(False)
+        total = float(sum(float(error(i)) for i in range(len(cameras))))
+        state = [t.detach().clone() for t in (*mirror.buffers(), *parameters)]
+        found.append((total if np.isfinite(total) else np.inf, state))
+    best = min(found, key=lambda pair: pair[0])[1]
+    with torch.no_grad():
+        for tensor, value in zip((*mirror.buffers(), *parameters), best, strict=True):
+            tensor.copy_(value)
+
+
+def _body_points(
+    mirror: QuadricWarp | PlaneWarp, volume: ReflectionVolume, capture: Capture
+) -> Float[torch.Tensor, "n 3"] | None:
+    """Points on the visual hull of what may be a round body; none for planes, bowls and sheets."""
+    if isinstance(mirror, PlaneWarp) or mirror.concave or _bent(mirror, volume):
+        return None
+    masks = volume_masks(capture, volume.name)
+    points = sample_visual_hull(volume, masks, 2000, np.random.default_rng(0))[0]
+    return torch.from_numpy(points).to(mirror.start_center)
+
+
+def off_body(
+    points: Float[torch.Tensor, "n 3"], center: Float[torch.Tensor, "3"], axes: Float[torch.Tensor, "3 3"]
+) -> Float[torch.Tensor, ""]:
+    """How far the points of a visual hull lie from an ellipsoid: `fit_body`'s loss, differentiable."""
+    inverse = torch.linalg.inv(axes)
+    scaled = (points - center) @ inverse.T
+    norms = scaled.norm(dim=1).clamp_min(1e-9)
+    distances = (norms - 1) * norms / (scaled @ inverse).norm(dim=1).clamp_min(1e-9)
+    return torch.log1p((distances / (BODY_SCALE * axes.norm(dim=0).mean())) ** 2).mean()
+
+
+def _bent(mirror: QuadricWarp, volume: ReflectionVolume) -> list[tuple[np.ndarray, np.ndarray]]:
+    return [] if len(mirror.log_radii) == 1 else fit_bent_sheet(volume)
+
+
+def _starts(
+    mirror: QuadricWarp | PlaneWarp, volume: ReflectionVolume, body: torch.Tensor | None
+) -> list[list[torch.Tensor]]:
+    """Buffers of a mirror to start from: as it is; convex ones smaller too and as the body in the visual hull, or bent
+    sheets where the volume is flat."""
+    start = [b.clone() for b in mirror.buffers()]
+    if isinstance(mirror, PlaneWarp) or mirror.concave:
+        return [start]
+    center, axes, concave = start
+    if body is None:
+        found, sizes = _bent(mirror, volume), (1.0,)
+    else:
+        points, *shape = (t.cpu().numpy().astype(float) for t in (body, center, axes))
+        found, sizes = [fit_body(points, *shape, sphere=len(mirror.log_radii) == 1)], _SIZES
+    others = [[torch.from_numpy(c).to(center), torch.from_numpy(a).to(axes), concave] for c, a in found]
+    return [[center, size * axes, concave] for size in sizes] + others
+
+
+def _middle_box(core: ReflectionVolume, camera: Camera) -> Viewport | None:
+    """The box around a volume in a view; None where it is not seen."""
+    rows, columns = np.nonzero(core.project_mask(camera))
+    if not len(rows):
+        return None
+    x0, y0 = int(columns.min()), int(rows.min())
+    return Viewport(x0, y0, int(columns.max()) - x0 + 1, int(rows.max()) - y0 + 1)
