@@ -319,6 +319,20 @@ def test_a_mask_that_contradicts_the_others_is_named_at_once_and_before_it_is_sa
     assert np.array_equal(store.mask("ball", 4), true_mask(store, 4))
 
 
+def test_a_mask_of_a_view_where_something_stands_before_the_object_is_pointed_out_and_left_out(client, store):
+    paint(store, range(8))
+    part = true_mask(store, 4)
+    columns = np.flatnonzero(part.any(0))
+    part[:, columns[: len(columns) // 2]] = False
+    report = client.post("api/report", json={"reflector": "ball", "masks": {"4": encode_runs(part)}}).json()
+    whole = client.post("api/report", json={"reflector": "ball", "masks": {}}).json()
+    assert report["problem"]["views"] == [4]
+    assert "part" in report["problem"]["found"]
+    assert sorted(report["fits"]) == ["0", "1", "2", "3", "5", "6", "7"]
+    assert report["mesh"]["radius"] >= whole["mesh"]["radius"]
+    assert whole["problem"] is None
+
+
 def test_a_mask_that_is_far_too_wide_is_pointed_out(client, store):
     import cv2
 
