@@ -435,6 +435,16 @@ def test_a_flat_mirror_seen_from_its_side_is_not_taken_for_a_hidden_one():
     assert partly_hidden(masks_of(sheet, cameras)) == []
 
 
+def test_masks_that_contradict_each_other_are_named_with_their_reflector_however_many_there_are():
+    masks = ring_masks(0.6 * ball(), {})
+    elsewhere = np.zeros_like(masks[3][2])
+    elsewhere[5:12, 5:12] = True
+    masks[3] = (*masks[3][:2], elsewhere)
+    assert partly_hidden(masks) == []
+    with pytest.raises(UserError, match="The masks of ball contradict"):
+        volume_from_masks("ball", masks)
+
+
 def test_few_masks_are_all_believed():
     masks = ring_masks(0.6 * ball(), {4: slice(0, 80)})
     assert partly_hidden(masks[:6]) == []

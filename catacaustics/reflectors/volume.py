@@ -385,13 +385,16 @@ def partly_hidden(masks: list[tuple[str, Camera, Bool[np.ndarray, "height width"
     rest off its volume.
 
     Such a mask is smaller than the others' volume there, and takes away what two others show. Masks from nearby
-    directions are no witnesses, as the same thing may stand before them; where there are too few, none is named. Found
-    one by one, the smallest first. Raises as `volume_from_masks`.
+    directions are no witnesses, as the same thing may stand before them; where there are too few, or the rest makes no
+    volume, none is named. Found one by one, the smallest first.
     """
     found: list[str] = []
     masks = list(masks)
     while len(masks) > _WITNESSES:
-        hidden = _most_hidden(masks, volume_from_masks("", masks))
+        try:
+            hidden = _most_hidden(masks, volume_from_masks("", masks))
+        except MaskError:
+            return found[:-1]
         if hidden is None:
             break
         found.append(masks.pop(hidden)[0])
