@@ -140,6 +140,9 @@ class TrainConfig:
     lr_network: float = 1e-3
     lr_network_final: float = 1e-4
     warp_weight_decay: float = 1e-2
+    guesses: bool | None = None
+    """Start from stereo's guesses, too, where no three views agree. Left out: no, or as a trial decides for a model of
+    auto."""
     refine_poses: bool | None = None
     """Learn small corrections of the training cameras' poses. Left out: no, or as trials decide where a model is auto
     and there are 30 minutes or more."""

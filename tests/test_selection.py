@@ -10,6 +10,7 @@ from toy import make_toy_capture
 from catacaustics.capture.dataset import open_capture
 from catacaustics.config import TrainConfig
 from catacaustics.errors import UserError
+from catacaustics.points import write_ply
 from catacaustics.reflectors.volume import ReflectionVolume, build_volume
 from catacaustics.training import mirrors, selection
 from catacaustics.training.initialize import named_reflectors
@@ -129,6 +130,21 @@ def test_a_short_training_does_not_try_networks_and_says_so(choose, capsys):
     assert not {"neural", "quadric+neural"} & {name for name, _ in tried}
     assert "neural and quadric+neural are not tried" in capsys.readouterr().out
     assert "Not tried" in (chosen.run / "model_choice.html").read_text()
+
+
+@pytest.mark.parametrize("gain", [-1.0, 0.1, 1.0])
+def test_guesses_of_stereo_are_taken_only_where_a_trial_gains_by_them(choose, tmp_path, gain):
+    points = open_capture(tmp_path / "capture").points()
+    write_ply(tmp_path / "capture" / "guesses.ply", points)
+    chosen, tried = choose(lambda name, _: 20.0 + gain * (name == "guesses too"))
+    assert ("guesses too", 1) in tried
+    assert chosen.guesses == (gain == 1.0)
+
+
+def test_a_capture_without_guesses_or_a_user_who_decided_needs_no_trial_of_them(choose):
+    chosen, tried = choose(lambda *_: 20.0)
+    assert "guesses too" not in {name for name, _ in tried}
+    assert not chosen.guesses
 
 
 @pytest.mark.parametrize(("minutes", "steps"), [(2.0, 50), (15.0, 125), (30.0, 250), (None, 250)])

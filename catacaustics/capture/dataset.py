@@ -3,7 +3,7 @@
     images/                   undistorted photographs, any names, subfolders allowed
     sparse/0/                 their COLMAP model: PINHOLE cameras, poses
     points.ply                fused multi-view-stereo points with normals
-    guesses.ply               where there are none: what one or two views say of places that no others confirm
+    guesses.ply               for its holes: what one or two views say, and the colours of others do not contradict
     masks/REFLECTOR/STEM.png  white = reflector; a reflector is masked in some views or in all
     split.json                {"train": [names], "held_out": [names]}, held-out views in path order
 
@@ -78,11 +78,10 @@ class Capture:
         """The fused cloud; raises UserError where there is none yet."""
         return read_ply(self.root / "points.ply")
 
-    def points_and_guesses(self) -> PointCloud:
-        """The fused cloud and, where the capture has them, guesses that fill its holes: to start a training from, not
-        to measure by."""
-        guesses = self.root / "guesses.ply"
-        return self.points().joined(read_ply(guesses)) if guesses.is_file() else self.points()
+    def guesses(self) -> PointCloud | None:
+        """Points for the holes of the fused cloud, many of them wrong; None where the capture has none."""
+        path = self.root / "guesses.ply"
+        return read_ply(path) if path.is_file() else None
 
     def _check_size(self, image: np.ndarray, view: View, path: Path) -> None:
         height, width = image.shape[:2]

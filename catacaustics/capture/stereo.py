@@ -20,7 +20,7 @@ import torch
 from tqdm import tqdm
 
 from catacaustics.cameras import Camera, pixel_centers
-from catacaustics.capture.dataset import Capture
+from catacaustics.capture.dataset import Capture, View
 from catacaustics.capture.fusion import (
     fill_holes,
     fuse_maps,
@@ -39,7 +39,7 @@ from catacaustics.errors import UserError
 from catacaustics.geometry import normalize
 from catacaustics.images import resize, write_image
 from catacaustics.points import PointCloud
-from catacaustics.shapes import Float
+from catacaustics.shapes import Bool, Float
 
 _VERSION = 1
 """Raise when the maps change for the same settings: old ones are then made again."""
@@ -58,6 +58,9 @@ MAX_DEPTH_ERROR = 0.01
 
 MAX_NORMAL_ERROR = 40.0
 """Angle in degrees within which views agree."""
+
+SAME_COLOR = 0.06
+"""Mean absolute difference of RGB in [0, 1] up to which a guess has the colour that a view shows."""
 
 MASK_MARGIN = 3
 """Pixels around a reflector that give no points either: their correlation windows reach into it."""
@@ -110,7 +113,8 @@ def fuse_capture(
     filled = cloud
     for views in range(min_views - 1, 0, -1):
         filled = fill_holes(filled, fused(views))
-    return cloud, filled.select(np.arange(len(cloud), len(filled)))
+    guesses = filled.select(np.arange(len(cloud), len(filled)))
+    return cloud, guesses.select(stereo.colors_agree(guesses, kind))
 
 
 class _Stereo:
@@ -254,6 +258,30 @@ class _Stereo:
             if not path.is_file():
                 write_image(path, resize(self.capture.image(view), camera.width, camera.height))
 
+    def colors_agree(self, cloud: PointCloud, kind: str) -> Bool[np.ndarray, "n"]:
+        """Whether the views that could see a point show its colour there: 3 at least, and most of them. A point that
+        floats before something else is seen before other colours from elsewhere."""
+        positions = cloud.positions.astype(np.float64)
+        agree, seen = np.zeros((2, len(cloud)), int)
+        for view, camera in zip(self.views, self.cameras, strict=True):
+            small = _reduced(camera, COARSE_SIZE)
+            image = resize(self.capture.image(view), small.width, small.height).astype(np.float32) / 255
+            inside, pixels, depth = in_frame(small, positions)
+            known = look_up(read_map(map_paths(self.folder, view.name, kind)[0]), camera, positions)[0]
+            free = inside & ((known == 0) | (depth <= 1.03 * known))
+            columns, rows = np.where(inside[:, None], pixels, 0).astype(int).T
+            mask = self._reflectors(view, small)
+            free &= True if mask is None else ~mask[rows, columns]
+            seen += free
+            agree += free & (np.abs(image[rows, columns] - cloud.colors).mean(1) < SAME_COLOR)
+        return (agree >= 3) & (agree >= 0.6 * seen)
+
+    def _reflectors(self, view: View, camera: Camera) -> Bool[np.ndarray, "height width"] | None:
+        """Where a view shows reflectors, at a camera's size; None where it was not masked."""
+        masks = [self.capture.mask(view, reflector) for reflector in self.capture.reflectors]
+        masks = [resize(m.astype(np.float32), camera.width, camera.height) > 0 for m in masks if m is not None]
+        return np.any(masks, 0) if masks else None
+
     def write_masks(self) -> None:
         """Write black where a reflector is, for the fusion; the maps themselves do not depend on the masks."""
         import cv2
@@ -261,12 +289,9 @@ class _Stereo:
         shutil.rmtree(self.folder / "masks", ignore_errors=True)
         kernel = np.ones((2 * MASK_MARGIN + 1,) * 2, np.uint8)
         for view, camera in zip(self.views, self.cameras, strict=True):
-            masks = [self.capture.mask(view, reflector) for reflector in self.capture.reflectors]
-            masks = [
-                resize(mask.astype(np.float32), camera.width, camera.height) > 0 for mask in masks if mask is not None
-            ]
-            if masks:
-                covered = cv2.dilate(np.any(masks, 0).astype(np.uint8), kernel)
+            mask = self._reflectors(view, camera)
+            if mask is not None:
+                covered = cv2.dilate(mask.astype(np.uint8), kernel)
                 write_image(self.folder / "masks" / f"{view.name}.png", covered == 0)
 
 

@@ -12,6 +12,7 @@ from catacaustics.page import html_page
 _TITLES = {
     "model": ("What are the reflectors?", "PSNR inside the reflector"),
     "environment": ("Does the scene need an environment map?", "PSNR of the whole image"),
+    "stereo": ("Do stereo's guesses help where no three views agree?", "PSNR of the whole image"),
     "reflection points": ("How many reflection points?", "PSNR inside the reflectors"),
     "primary points": ("How many primary points?", "PSNR of the whole image"),
     "photographs": ("Do poses or exposures need corrections?", "PSNR of the whole image, aligned"),

@@ -120,14 +120,18 @@ def mean_reflector_color(capture: Capture, volume: ReflectionVolume) -> Float[np
     return np.mean(pixels, axis=0).astype(np.float32) if pixels else np.full(3, 0.5, np.float32)
 
 
-def primary_seeds(capture: Capture, reflectors: list[Reflector], count: int, rng: np.random.Generator) -> Seeds:
-    """At most `count` stereo points outside the reflectors, and points on the reflectors' surfaces, which carry rho, in
-    random order.
+def primary_seeds(
+    capture: Capture, reflectors: list[Reflector], count: int, rng: np.random.Generator, guesses: bool = False
+) -> Seeds:
+    """At most `count` stereo points outside the reflectors, stereo's guesses among them where asked for, and points on
+    the reflectors' surfaces, which carry rho, in random order.
 
     Stereo has no points on a mirror, but something must hide what is behind it, and a glaze has paint below it. A
     surface gets as many points as the image has for its share, a quarter as dense: its sides are four pictures wide.
     """
-    cloud = capture.points_and_guesses()
+    cloud = capture.points()
+    if guesses and (guessed := capture.guesses()) is not None:
+        cloud = cloud.joined(guessed)
     for volume, _ in reflectors:
         cloud = cloud.select(~volume.contains(cloud.positions.astype(np.float64)))
     if len(cloud) > count:

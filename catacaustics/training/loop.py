@@ -100,7 +100,7 @@ def fit(
     rng = np.random.default_rng(config.seed)
     usual = usual_points(capture, [r.volume for r in reflectors], config)
     counts = {k: n if getattr(config, k) is None else getattr(config, k) for k, n in usual.items()}
-    seeds = [primary_seeds(capture, reflectors, counts["primary_points"], rng)]
+    seeds = [primary_seeds(capture, reflectors, counts["primary_points"], rng, bool(config.guesses))]
     reflectors = [r for r in reflectors if r.model != "none"]
     warps = start_warps(capture, reflectors, config)
     volumes = [r.volume for r in reflectors]

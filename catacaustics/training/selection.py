@@ -2,9 +2,10 @@
 
 The rule. Rungs are walked from the simplest to the most complex. A more complex one takes the place of the best so far
 only if its mean gain in PSNR inside the reflector exceeds both 0.2 dB and twice the standard error of the gains per
-view: what the noise of a few views could explain is not a reason. The environment map and larger clouds must earn their
-place by the same rule, judged on the whole image and inside the reflectors. All trials get the same steps; where the
-choice among rungs is close, the best of them go on for twice as many, and again, and the rule is asked among them.
+view: what the noise of a few views could explain is not a reason. The environment map, stereo's guesses and larger
+clouds must earn their place by the same rule, judged on the whole image and inside the reflectors. All trials get the
+same steps; where the choice among rungs is close, the best of them go on for twice as many, and again, and the rule is
+asked among them.
 """
 
 import shutil
@@ -134,6 +135,11 @@ def choose_models(capture: Capture, volumes: list[ReflectionVolume], config: Tra
         if best([without.whole, base.whole]) == 0:
             chosen["environment_width"] = 0
         taken["environment"] = [(without, base)[best([without.whole, base.whole])].name]
+    if config.guesses is None and capture.guesses() is not None:
+        base = trials.run("points that three views agree on", "stereo", chosen)
+        filled = trials.run("guesses too", "stereo", chosen | {"guesses": True})
+        chosen["guesses"] = best([base.whole, filled.whole]) == 1
+        taken["stereo"] = [(base, filled)[chosen["guesses"]].name]
     for question, field in (("reflection points", "reflection_points"), ("primary points", "primary_points")):
         if hurried or getattr(config, field) is not None or (field == "reflection_points" and set(models) == {"none"}):
             continue
