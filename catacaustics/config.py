@@ -473,7 +473,7 @@ class RefractTrainConfig:
     """Train a refraction model: its R-buffer generator on coordinates, then its renderer with the generator frozen.
 
     The defaults are for minutes on a CPU. The papers: --size paper --crop 0 --lr-generator 7.5e-5 --lr-renderer 1e-4
-    --lr-final-share 1 --weight-index 1 --weight-normal 2, for hours on a GPU.
+    --lr-final-share 1 --weight-index 1 --weight-normal 2 --weight-direction 0 --crop-generator 0, for hours on a GPU.
     """
 
     data: Path
@@ -501,9 +501,13 @@ class RefractTrainConfig:
     clock: Literal["wall", "cpu"] = "wall"
     """What minutes are measured by; cpu: processor time of this process, fair where others use the machine too."""
     batch: int = 8
-    """Crops of a step. Many small ones tell more than few large ones: each comes from another frame."""
+    """Crops of a renderer's step."""
     crop: int = 32
-    """Side of the square training crops in pixels; 0 takes whole images."""
+    """Side of the renderer's square training crops in pixels; 0 takes whole images."""
+    batch_generator: int = 16
+    """Crops of a generator's step. Many small ones tell more than few large ones: each comes from another frame."""
+    crop_generator: int = 16
+    """Side of the generator's crops; 0 takes whole images."""
     glass_share: float = 0.8
     """Share of the crops centred on a refractive pixel; the others are anywhere."""
     lr_generator: float = 4e-3
@@ -512,6 +516,9 @@ class RefractTrainConfig:
     """Rates fall to this share of their start along a half cosine; 1 keeps them."""
     weight_decay: float = 1e-4
     weight_coordinates: float = 1.0
+    weight_direction: float = 2.0
+    """Direction from the first surface to a landing point in the world (papers: 0): unlike the point, it does not
+    depend on how far things are, and is learned faster."""
     weight_tv: float = 1.5e-8
     """Total variation of coordinates, summed over an image."""
     weight_index: float = 0.1

@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import adaptive_avg_pool2d, cross_entropy, one_hot
+from torch.nn.functional import adaptive_avg_pool2d, cross_entropy, normalize, one_hot
 
 from catacaustics.errors import UserError
 from catacaustics.files import read_tensors, write_tensors
@@ -19,6 +19,7 @@ from catacaustics.refraction.lookup import (
     Screen,
     Textures,
     inside_screen,
+    meet_screen,
     project,
     sample_probe,
     sample_screen,
@@ -27,7 +28,7 @@ from catacaustics.refraction.lookup import (
 from catacaustics.refraction.networks import SIZES, Generator, Renderer
 from catacaustics.shapes import Bool, Float, Int, UInt8
 
-FORMAT = 1
+FORMAT = 2
 Kind = Literal["uv", "world", "screen", "hybrid"]
 """What a generator predicts and where its colours are looked up: texture coordinates of every opaque object and which
 object it is (CrystalNet); world coordinates, on the screen (SSNRB); screen coordinates (SSNRB's ablation); world
@@ -48,6 +49,8 @@ _FAR_NDC = 2.0
 """Screen coordinates are learned up to here; what lands farther outside the image counts as landing there."""
 EDGE, TOLERANCE = 0.02, 0.1
 """hybrid: softness at the image's border (ndc) and of the occlusion test (scene units)."""
+MARCH = tuple(0.6 + 0.05 * i for i in range(21))
+"""hybrid: where the ray out of the glass is compared with the screen's depth, 1 at the predicted landing point."""
 
 
 class Prediction(NamedTuple):
@@ -61,12 +64,14 @@ class Prediction(NamedTuple):
 
 
 class LossWeights(NamedTuple):
-    """Of the generator: coordinates (L1), total variation (sum), object index (cross entropy), normals (L1)."""
+    """Of the generator: coordinates (L1), total variation (sum), object index (cross entropy), normals (L1), unit
+    directions from the first surface to landing points in the world (L1)."""
 
     coordinates: float = 1.0
     tv: float = 1.5e-8
     entropy: float = 1.0
     normal: float = 2.0
+    direction: float = 0.0
 
 
 PAPER_WEIGHTS = LossWeights()
@@ -105,9 +110,9 @@ def split_output(kind: Kind, output: Float[Tensor, "b c h w"]) -> Prediction:
     if kind == "uv":
         t = rest.shape[1] // 3
         return Prediction(normal, None, None, rest[:, : 2 * t].unflatten(1, (t, 2)), rest[:, 2 * t :])
-    return (
-        Prediction(normal, None, rest, None, None) if kind == "screen" else Prediction(normal, rest, None, None, None)
-    )
+    if kind == "screen":
+        return Prediction(normal, None, rest, None, None)
+    return Prediction(normal, rest, None, None, None)
 
 
 def truth(kind: Kind, buffers: Buffers, textures: int) -> Prediction:
@@ -130,6 +135,9 @@ def generator_losses(
     coordinates = []
     if prediction.world is not None:
         losses["world"] = weights.coordinates * _masked_l1(prediction.world, buffers.landing, lands)
+        first = first_surface(buffers)
+        ways = [normalize(point - first, dim=1) for point in (prediction.world, buffers.landing)]
+        losses["direction"] = weights.direction * _masked_l1(ways[0], ways[1], lands)
         coordinates.append(prediction.world)
     if prediction.ndc is not None:
         ndc, depth = project(buffers.landing, buffers.world_to_clip)
@@ -154,6 +162,12 @@ def generator_losses(
 def select(values: Float[Tensor, "b t c h w"], index: Int[Tensor, "b h w"]) -> Float[Tensor, "b c h w"]:
     """Each pixel's own of t maps."""
     return torch.take_along_dim(values, index[:, None, None], 1)[:, 0]
+
+
+def first_surface(buffers: Buffers) -> Float[Tensor, "b 3 h w"]:
+    """Where rays first meet glass; zero where they do not."""
+    depth = torch.where(buffers.objects[:, :, 0] > 0, buffers.objects[:, :, 7], torch.inf)
+    return select(buffers.objects[:, :, 1:4], depth.argmin(1))
 
 
 def _masked_mean(values: Float[Tensor, "b c h w"], mask: Bool[Tensor, "b 1 h w"]) -> Float[Tensor, ""]:
@@ -191,8 +205,12 @@ def landing_color(
     by_screen = sample_screen(screen.color, ndc)
     if kind == "world":
         return by_screen
-    share = inside_screen(ndc, EDGE) * visibility(screen.depth, ndc, depth, TOLERANCE)
-    return share * by_screen + (1 - share) * sample_probe(screen.probe, screen.probe_position, prediction.world)
+    by_probe = sample_probe(screen.probe, screen.probe_position, prediction.world)
+    start = first_surface(buffers)
+    points, met = meet_screen(screen.depth, buffers.world_to_clip, start, prediction.world, MARCH, TOLERANCE)
+    ndc, depth = project(points, buffers.world_to_clip)
+    share = inside_screen(ndc, EDGE) * torch.maximum(met.float(), visibility(screen.depth, ndc, depth, TOLERANCE))
+    return share * sample_screen(screen.color, ndc) + (1 - share) * by_probe
 
 
 def blurred_colors(world: Float[Tensor, "b 3 h w"], screen: Screen) -> Float[Tensor, "b c h w"]:
