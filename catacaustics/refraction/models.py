@@ -57,7 +57,7 @@ class Prediction(NamedTuple):
     """A generator's output by meaning; what its kind does not predict is None. t opaque objects."""
 
     normal: Float[Tensor, "b 3 h w"]
-    world: Float[Tensor, "b 3 h w"] | None
+    world: Float[Tensor, "b 3 h w"]
     ndc: Float[Tensor, "b 2 h w"] | None
     uv: Float[Tensor, "b t 2 h w"] | None
     logits: Float[Tensor, "b t h w"] | None
@@ -96,7 +96,7 @@ def same_generator(first: str, second: str) -> bool:
 
 def output_channels(kind: Kind, textures: int) -> int:
     """Channels of a generator for a scene with so many textures."""
-    return 3 + {"uv": 3 * textures, "world": 3, "screen": 2, "hybrid": 3}[kind]
+    return 6 + {"uv": 3 * textures, "screen": 2}.get(kind, 0)
 
 
 def r_channels(kind: Kind | None) -> int:
@@ -106,24 +106,23 @@ def r_channels(kind: Kind | None) -> int:
 
 def split_output(kind: Kind, output: Float[Tensor, "b c h w"]) -> Prediction:
     """Name the channels of a generator's output."""
-    normal, rest = output[:, :3], output[:, 3:]
+    normal, world, rest = output[:, :3], output[:, 3:6], output[:, 6:]
     if kind == "uv":
         t = rest.shape[1] // 3
-        return Prediction(normal, None, None, rest[:, : 2 * t].unflatten(1, (t, 2)), rest[:, 2 * t :])
+        return Prediction(normal, world, None, rest[:, : 2 * t].unflatten(1, (t, 2)), rest[:, 2 * t :])
     if kind == "screen":
-        return Prediction(normal, None, rest, None, None)
-    return Prediction(normal, rest, None, None, None)
+        return Prediction(normal, world, rest, None, None)
+    return Prediction(normal, world, None, None, None)
 
 
 def truth(kind: Kind, buffers: Buffers, textures: int) -> Prediction:
     """The prediction that a perfect generator would make; texture coordinates are right for the object landed on."""
-    world = buffers.landing if kind in ("world", "hybrid") else None
     ndc = project(buffers.landing, buffers.world_to_clip)[0] if kind == "screen" else None
     uv = logits = None
     if kind == "uv":
         uv = buffers.landing_uv[:, None].expand(-1, textures, -1, -1, -1)
         logits = one_hot(buffers.landing_object.clamp_min(0), textures).movedim(-1, 1).float()
-    return Prediction(buffers.landing_normal, world, ndc, uv, logits)
+    return Prediction(buffers.landing_normal, buffers.landing, ndc, uv, logits)
 
 
 def generator_losses(
@@ -131,14 +130,14 @@ def generator_losses(
 ) -> dict[str, Tensor]:
     """Means over the pixels that land somewhere; total variation over the whole image, of coordinates."""
     lands = buffers.landing_object[:, None] >= 0
-    losses = {"normal": weights.normal * _masked_l1(prediction.normal, buffers.landing_normal, lands)}
-    coordinates = []
-    if prediction.world is not None:
-        losses["world"] = weights.coordinates * _masked_l1(prediction.world, buffers.landing, lands)
-        first = first_surface(buffers)
-        ways = [normalize(point - first, dim=1) for point in (prediction.world, buffers.landing)]
-        losses["direction"] = weights.direction * _masked_l1(ways[0], ways[1], lands)
-        coordinates.append(prediction.world)
+    first = first_surface(buffers)
+    ways = [normalize(point - first, dim=1) for point in (prediction.world, buffers.landing)]
+    losses = {
+        "normal": weights.normal * _masked_l1(prediction.normal, buffers.landing_normal, lands),
+        "world": weights.coordinates * _masked_l1(prediction.world, buffers.landing, lands),
+        "direction": weights.direction * _masked_l1(ways[0], ways[1], lands),
+    }
+    coordinates = [prediction.world]
     if prediction.ndc is not None:
         ndc, depth = project(buffers.landing, buffers.world_to_clip)
         target = ndc.clamp(-_FAR_NDC, _FAR_NDC)
@@ -200,7 +199,6 @@ def landing_color(
     assert screen is not None, "this kind looks colours up on the screen"
     if prediction.ndc is not None:
         return sample_screen(screen.color, prediction.ndc)
-    assert prediction.world is not None
     ndc, depth = project(prediction.world, buffers.world_to_clip)
     by_screen = sample_screen(screen.color, ndc)
     if kind == "world":
@@ -225,7 +223,7 @@ def r_buffer(
 ) -> Float[Tensor, "b r h w"]:
     """Colour and normal at the landing points, then hybrid's blurred colours; zero where there is no glass."""
     parts = [landing_color(kind, prediction, buffers, screen, textures), prediction.normal]
-    if kind == "hybrid" and prediction.world is not None and screen is not None:
+    if kind == "hybrid" and screen is not None:
         parts.append(blurred_colors(prediction.world, screen))
     return torch.cat(parts, 1) * buffers.covered
 
@@ -331,8 +329,7 @@ class RefractionModel(nn.Module):
 
 
 def new_generator(kind: Kind, size: str, textures: int) -> Generator:
-    world = kind in ("world", "hybrid")
-    return Generator(output_channels(kind, textures), SIZES[size], world).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
+    return Generator(output_channels(kind, textures), SIZES[size]).to(memory_format=torch.channels_last)  # pyright: ignore[reportCallIssue]
 
 
 def new_renderer(kind: Kind | None, size: str) -> Renderer:

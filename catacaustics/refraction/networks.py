@@ -249,17 +249,16 @@ class Generator(nn.Module):
 
     A ray is followed through the nearest body, segment by segment; from where it leaves the body it goes
     distance * direction, to a point in the world. How rays are bent is a smooth function that knows nothing of the
-    scene behind, unlike the point where they land. The point is the output, channels 3 to 5, with `world`; without, the
-    last layers turn it into other coordinates. Zero where there is no glass.
+    scene behind, unlike the point where they land. The point is channels 3 to 5 of the output; the last layers turn it
+    into other coordinates, where there are any. Zero where there is no glass.
 
     Args:
-        outputs: channels.
-        world: whether the world coordinates are what is wanted.
+        outputs: channels, 6 or more.
     """
 
-    def __init__(self, outputs: int, size: Size, world: bool):
+    def __init__(self, outputs: int, size: Size):
         super().__init__()
-        self.octaves, self.outputs, self.world = size.octaves, outputs, world
+        self.octaves, self.outputs = size.octaves, outputs
         self.objects = ObjectEncoder(size)
         self.trunk = UNet(size.width + 3 * (1 + 2 * size.octaves) + 3 + 1 + 3, size)
         inside, place = 4 * size.width, 3 * (1 + 2 * size.octaves)
@@ -267,8 +266,9 @@ class Generator(nn.Module):
         self.segment = Segment(2 * size.width, size)
         self.reach = _layers(2 * size.width + place + 3 * (1 + 2 * _TURNS) + 1, inside, inside)
         self.leave = _flat(inside, [0.5, 0.0, 0.0, 0.0])
-        self.land = None if world else _layers(inside + place, inside, inside)
-        self.last = _flat(inside, [0.0] * (3 if world else outputs))
+        self.last = _flat(inside, [0.0] * 3)
+        self.land = _layers(inside + place, inside, inside) if outputs > 6 else None
+        self.other = _flat(inside, [0.0] * (outputs - 6)) if outputs > 6 else None
 
     def forward(self, buffers: Buffers) -> Float[Tensor, "b outputs h w"]:
         views = object_views(buffers, self.octaves)
@@ -287,10 +287,10 @@ class Generator(nn.Module):
         x = self.reach(torch.cat([x, encode(start, self.octaves), encode(direction, _TURNS), within], -1))
         distance, more = _precise(self.leave, x).split([1, 3], -1)
         landing = start + softplus(distance) * normalize(direction + more, dim=-1)
-        if self.land is None:
-            found = torch.cat([_precise(self.last, x), landing], -1)
-        else:
-            found = _precise(self.last, self.land(torch.cat([x, encode(landing, self.octaves)], -1)))
+        found = torch.cat([_precise(self.last, x), landing], -1)
+        if self.land is not None and self.other is not None:
+            x = self.land(torch.cat([x, encode(landing, self.octaves)], -1))
+            found = torch.cat([found, _precise(self.other, x)], -1)
         whole = found.new_zeros(*rows.covered.shape, self.outputs)
         whole[rows.covered] = found
         return _image(whole)
