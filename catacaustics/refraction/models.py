@@ -50,7 +50,8 @@ _FAR_NDC = 2.0
 EDGE, TOLERANCE = 0.02, 0.1
 """hybrid: softness at the image's border (ndc) and of the occlusion test (scene units)."""
 MARCH = tuple(0.6 + 0.05 * i for i in range(21))
-"""hybrid: where the ray out of the glass is compared with the screen's depth, 1 at the predicted landing point."""
+"""hybrid: where the line from the first surface is compared with the screen's depth, 1 at the predicted landing point.
+R.L1 where landing points are seen: 0.160 without, 0.154 with it (`checker`, validation frames, one seed)."""
 
 
 class Prediction(NamedTuple):
@@ -190,8 +191,9 @@ def landing_color(
     """Colour (albedo, sRGB-encoded) at the predicted landing points.
 
     uv: bilinear in the texture of the most probable object. world: p_ndc = (P V p)_xyz / (P V p)_w, bilinear in the
-    screen-space colour buffer, clamped to its border. hybrid: as world where the point is on the screen and
-    its depth is the screen's, in the probe's panorama elsewhere, with a soft step between.
+    screen-space colour buffer, clamped to its border. hybrid: moved onto what the
+    screen shows (MARCH), then as world where the point is on the screen and its depth is the screen's, in the probe's
+    panorama elsewhere, with a soft step between.
     """
     if prediction.uv is not None and prediction.logits is not None:
         index = prediction.logits.argmax(1)
