@@ -13,9 +13,6 @@ from catacaustics.refraction.frames import Frame, Frames
 from catacaustics.refraction.lookup import Screen
 from catacaustics.shapes import Bool, Float, Int
 
-OBJECT_CHANNELS = 9
-"""Mask, position, normal, depth and index of refraction, all zero where the object is not seen."""
-
 
 class Buffers(NamedTuple):
     """Frames, channels first; k is the largest number of transparent objects, at least 1, missing ones are all zero."""
@@ -29,6 +26,7 @@ class Buffers(NamedTuple):
     rays: Float[Tensor, "b 3 h w"]
     """Unit directions of the pixels' rays, from the camera."""
     objects: Float[Tensor, "b k 9 h w"]
+    """Mask, position, normal, depth and index of refraction, all zero where the object is not seen."""
     refractive: Bool[Tensor, "b 1 h w"]
     internal_reflection: Bool[Tensor, "b 1 h w"]
     landing: Float[Tensor, "b 3 h w"]
