@@ -10,7 +10,6 @@ from typing import Literal
 Model = Literal["auto", "none", "static", "plane", "sphere", "ellipsoid", "concave", "neural", "quadric+neural"]
 """Rungs of the ladder of warps (reflectors/warps.py); auto chooses by trials, none trains the primary cloud alone."""
 
-
 CameraPath = Literal["held-out", "spline", "still"]
 """Camera paths of films."""
 
@@ -476,7 +475,7 @@ class RefractTrainConfig:
     """Train a refraction model: its R-buffer generator on coordinates, then its renderer with the generator frozen.
 
     The defaults are for minutes on a CPU. The papers: --size paper --crop 0 --lr-generator 7.5e-5 --lr-renderer 1e-4
-    --lr-final-share 1 --weight-index 1 --weight-normal 2, for hours on a GPU.
+    --lr-final-share 1 --weight-index 1 --weight-normal 2 --weight-direction 0 --crop-generator 0, for hours on a GPU.
     """
 
     data: Path
@@ -504,9 +503,11 @@ class RefractTrainConfig:
     clock: Literal["wall", "cpu"] = "wall"
     """What minutes are measured by; cpu: processor time of this process, fair where others use the machine too."""
     batch: int = 8
-    """Crops of a step. Many small ones tell more than few large ones: each comes from another frame."""
     crop: int = 32
-    """Side of the square training crops in pixels; 0 takes whole images."""
+    """Side in pixels of the renderer's square training crops, `batch` of them a step; 0 takes whole images."""
+    batch_generator: int = 16
+    crop_generator: int = 16
+    """The same for the generator. Many small crops tell more than few large ones: each comes from another frame."""
     glass_share: float = 0.8
     """Share of the crops centred on a refractive pixel; the others are anywhere."""
     lr_generator: float = 4e-3
@@ -515,13 +516,13 @@ class RefractTrainConfig:
     """Rates fall to this share of their start along a half cosine; 1 keeps them."""
     weight_decay: float = 1e-4
     weight_coordinates: float = 1.0
+    weight_direction: float = 2.0
+    """Direction from the first surface to the landing point (papers: 0): it does not depend on how far things are."""
     weight_tv: float = 1.5e-8
     """Total variation of coordinates, summed over an image."""
     weight_index: float = 0.1
-    """Cross entropy of the object landed on (papers: 1)."""
     weight_normal: float = 0.2
-    """Normals at the landing points (papers: 2). Both leave the coordinates behind in a short training if they weigh as
-    much as in the papers."""
+    """Of the object landed on (cross entropy) and normals there (papers: 1 and 2, too much in a short training)."""
     weight_l1: float = 1.0
     weight_dssim: float = 1.0
     precision: Literal["auto", "float32", "bfloat16"] = "auto"
@@ -573,8 +574,7 @@ class RefractReportConfig:
     generator_share: float = 0.5
     """Of the minutes; a model without generator gives them all to its renderer."""
     coordinates: Literal["predicted", "true"] = "predicted"
-    """true: renderers get the true landing points for the renderer's share of the minutes: the best that lookups can
-    give."""
+    """true: renderers get true landing points, for their share of the minutes: the best that lookups can give."""
     clock: Literal["wall", "cpu"] = "wall"
     """What minutes are measured by; cpu: processor time of this process, fair where others use the machine too."""
     split: Literal["test", "val", "train"] = "test"

@@ -158,6 +158,9 @@ def toy_frame(rng, side=32, screen=64, balls=2, reference=True, textures=None, p
         object_normal=o_normal.astype(f),
         object_depth=o_depth.astype(f),
         object_ior=iors,
+        object_to_world=np.stack([np.column_stack([0.35 * np.eye(3), c]) for c in centers]).astype(f)
+        if k
+        else np.zeros((0, 3, 4), f),
         refractive=refractive,
         landing=(landing * lands).astype(f),
         landing_uv=(l_uv * lands).astype(f),

@@ -80,6 +80,9 @@ def test_every_scene_fills_every_buffer_with_sense(name):
     np.testing.assert_allclose(np.linalg.norm(frame.landing_normal[lands], axis=-1), 1, atol=1e-4)
     assert (frame.landing_normal[~lands] == 0).all()
     assert frame.object_ior.min() > 1.2
+    size = np.linalg.norm(frame.object_to_world[:, :, 0], axis=-1)[:, None, None]
+    turned = frame.object_to_world[:, :, :3] / size
+    np.testing.assert_allclose(turned @ turned.transpose(0, 2, 1), np.broadcast_to(np.eye(3), turned.shape), atol=1e-5)
     assert frame.parameters.min() >= 0
     assert frame.parameters.max() <= 1
     assert frame.reference.mean() > 0.2
@@ -204,7 +207,7 @@ def test_a_data_set_of_an_older_format_is_neither_read_nor_continued(tiny, tmp_p
     del card["format"]
     write_json(folder / "card.json", card)
     for use in (open_frames, lambda out: make_data(replace(TINY, out=out))):
-        with pytest.raises(UserError, match=r"(?s)format 1.*format 2.*empty folder"):
+        with pytest.raises(UserError, match=r"(?s)format 1.*format 3.*empty folder"):
             use(folder)
 
 

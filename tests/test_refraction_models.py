@@ -20,13 +20,14 @@ from catacaustics.refraction.frames import open_frames, write_shard
 from catacaustics.refraction.lookup import (
     Textures,
     inside_screen,
+    meet_screen,
     project,
     sample_probe,
     sample_screen,
     visibility,
 )
 from catacaustics.refraction.measures import landing_regions
-from catacaustics.refraction.networks import SIZES, ObjectEncoder, exit_guesses, refract
+from catacaustics.refraction.networks import SIZES, ObjectEncoder, back_guesses, object_views, refract
 
 SMALL = {"steps": 8, "batch": 2, "crop": 16, "checkpoint_minutes": 1e-9}
 
@@ -138,7 +139,7 @@ def test_hybrid_takes_the_screen_where_the_point_is_seen_and_the_probe_elsewhere
     assert regions["off screen"].sum() > 10
     assert np.median(color[regions["seen"]]) == 1
     assert color[regions["off screen"]] == pytest.approx(0.4, abs=1e-5)
-    nearer = screen._replace(depth=screen.depth - 0.5)
+    nearer = screen._replace(depth=0.2 * screen.depth)
     hidden = m.landing_color("hybrid", perfect, buffers, nearer, textures)[0, 0].numpy()
     assert (np.abs(hidden[regions["seen"]] - 0.4) < 1e-5).mean() > 0.9
 
@@ -172,7 +173,7 @@ def test_a_perfect_prediction_has_no_loss_but_total_variation_and_finds_the_righ
 
 
 def pixel(vector):
-    return torch.tensor(vector, dtype=torch.float32).view(1, -1, 1, 1)
+    return torch.tensor(vector, dtype=torch.float32)
 
 
 def test_refraction_follows_snell_and_grazes_beyond_the_critical_angle():
@@ -185,16 +186,52 @@ def test_refraction_follows_snell_and_grazes_beyond_the_critical_angle():
     assert grazing[2] == pytest.approx(0, abs=1e-3)
 
 
-def test_the_guess_of_a_ball_is_the_deviation_of_a_ball_and_a_sheet_with_flat_faces_bends_nothing():
+def test_the_guessed_backs_of_a_ball_and_of_a_flat_sheet_bend_rays_as_those_do():
     incidence, ior = np.radians(40), 1.5
-    ray = pixel([0, 0, -1])
+    ray = torch.tensor([0.0, 0, -1])
     normal = pixel([np.sin(incidence), 0, np.cos(incidence)])
-    ball = exit_guesses(ray, normal, pixel([ior]), pixel([0, 0, 1])).ball.flatten()
+    inside = refract(ray, normal, pixel([1 / ior]))
+    ball, _ = back_guesses(inside, normal, pixel([0, 0, 1]))
     deviation = 2 * (incidence - np.arcsin(np.sin(incidence) / ior))
-    assert ball.tolist() == pytest.approx([-np.sin(deviation), 0, -np.cos(deviation)], abs=1e-5)
-    flat = exit_guesses(ray, normal, pixel([ior]), normal).sheet
-    torch.testing.assert_close(flat, ray, atol=1e-5, rtol=0)
-    assert torch.equal(exit_guesses(ray, 0 * ray, pixel([0]), 0 * ray).ball, ray)
+    bent = refract(inside, -ball, pixel([ior]))
+    assert bent.tolist() == pytest.approx([-np.sin(deviation), 0, -np.cos(deviation)], abs=1e-5)
+    _, flat = back_guesses(inside, normal, normal)
+    torch.testing.assert_close(refract(inside, -flat, pixel([ior])), ray, atol=1e-5, rtol=0)
+
+
+def test_a_moved_and_turned_body_looks_the_same_from_a_camera_that_moves_along():
+    frame = toy_frame(np.random.default_rng(3), balls=1)
+    first = object_views(frame_buffers(frame), 4)
+    turn = np.array([[0.0, -1, 0], [1, 0, 0], [0, 0, 1]], np.float32)
+    names = ("position", "object_position", "object_normal", "object_to_world", "world_to_clip", "camera_position")
+    position, o_position, o_normal, matrix, clip, camera = (getattr(frame, name) for name in names)
+    back = np.eye(4, dtype=np.float32)
+    back[:3, :3] = turn.T
+    turned = replace(
+        frame,
+        position=position @ turn.T,
+        object_position=o_position @ turn.T,
+        object_normal=o_normal @ turn.T,
+        object_to_world=turn @ matrix,
+        world_to_clip=clip @ back,
+        camera_position=camera @ turn.T,
+    )
+    second = object_views(frame_buffers(turned), 4)
+    torch.testing.assert_close(second.path, first.path, atol=1e-4, rtol=0)
+
+
+def test_a_line_meets_the_screens_surface_nearest_to_the_point_and_nothing_where_it_leaves_the_screen(smooth_frame):
+    frame, _ = smooth_frame
+    buffers, screen = frame_buffers(frame), frame_screen(frame)
+    start = (0.2 * torch.from_numpy(frame.camera_position)).view(1, 3, 1, 1).expand_as(buffers.position)
+    too_far = start + 1.2 * (buffers.position - start)
+    shares = [0.6 + 0.05 * i for i in range(21)]
+    points, met = meet_screen(screen.depth, buffers.world_to_clip, start, too_far, shares, 0.3)
+    inner = (slice(None), slice(None), slice(4, -4), slice(4, -4))
+    assert met[inner].float().mean() > 0.95
+    assert (points - buffers.position).norm(dim=1, keepdim=True)[inner][met[inner]].median() < 0.01
+    beside = torch.tensor([0.0, 50.0, 0.0]).view(1, 3, 1, 1).expand_as(start)
+    assert not meet_screen(screen.depth, buffers.world_to_clip, start, beside, shares, 0.3)[1].any()
 
 
 @pytest.mark.parametrize("name", list(m.MODELS))
@@ -226,8 +263,8 @@ def test_the_encoder_gives_exactly_zero_for_an_object_out_of_view_also_after_tra
     buffers = frame_buffers(toy_frame(np.random.default_rng(8), balls=1))
     empty = buffers._replace(objects=0 * buffers.objects, poses=0 * buffers.poses)
     for encoder in (model.generator.objects, model.renderer.objects):
-        assert encoder(empty).abs().max() == 0
-        assert encoder(buffers).abs().max() > 0
+        assert encoder(object_views(empty, 4)).abs().max() == 0
+        assert encoder(object_views(buffers, 4)).abs().max() > 0
 
 
 def test_a_model_takes_any_number_of_objects_and_a_batch_of_frames_with_different_numbers(trained):

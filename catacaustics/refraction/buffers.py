@@ -13,9 +13,6 @@ from catacaustics.refraction.frames import Frame, Frames
 from catacaustics.refraction.lookup import Screen
 from catacaustics.shapes import Bool, Float, Int
 
-OBJECT_CHANNELS = 9
-"""Mask, position, normal, depth and index of refraction, all zero where the object is not seen."""
-
 
 class Buffers(NamedTuple):
     """Frames, channels first; k is the largest number of transparent objects, at least 1, missing ones are all zero."""
@@ -29,15 +26,16 @@ class Buffers(NamedTuple):
     rays: Float[Tensor, "b 3 h w"]
     """Unit directions of the pixels' rays, from the camera."""
     objects: Float[Tensor, "b k 9 h w"]
+    """Mask, position, normal, depth and index of refraction, all zero where the object is not seen."""
     refractive: Bool[Tensor, "b 1 h w"]
     internal_reflection: Bool[Tensor, "b 1 h w"]
     landing: Float[Tensor, "b 3 h w"]
     landing_uv: Float[Tensor, "b 2 h w"]
     landing_normal: Float[Tensor, "b 3 h w"]
     landing_object: Int[Tensor, "b h w"]
-    poses: Float[Tensor, "b k 6"]
-    """Mean position and mean normal of each object's seen part in the whole image: roughly where it is and how it
-    stands. Zero where it is not seen."""
+    poses: Float[Tensor, "b k 17"]
+    """How each object stands, zero where it is nowhere seen in the whole image: rotation body to world (9, by rows),
+    place (3), size, index of refraction, mean normal of its seen part (3)."""
     world_to_clip: Float[Tensor, "b 4 4"]
 
     @property
@@ -68,7 +66,6 @@ def frame_buffers(frame: Frame) -> Buffers:
     objects = np.concatenate(parts, -1, dtype=np.float32) * mask
     if not len(objects):
         objects = np.zeros((1, *objects.shape[1:]), np.float32)
-    poses = objects[..., 1:7].sum((1, 2)) / np.maximum(objects[..., :1].sum((1, 2)), 1)
     return Buffers(
         reference=image(frame.reference),
         position=image(frame.position),
@@ -84,9 +81,20 @@ def frame_buffers(frame: Frame) -> Buffers:
         landing_uv=image(frame.landing_uv),
         landing_normal=image(frame.landing_normal),
         landing_object=torch.from_numpy(frame.landing_object.astype(np.int64))[None],
-        poses=torch.from_numpy(poses)[None],
+        poses=torch.from_numpy(_poses(frame, objects))[None],
         world_to_clip=torch.from_numpy(frame.world_to_clip)[None],
     )
+
+
+def _poses(frame: Frame, objects: Float[np.ndarray, "k h w 9"]) -> Float[np.ndarray, "k 17"]:
+    """`Buffers.poses` of one frame."""
+    poses = np.zeros((len(objects), 17), np.float32)
+    for pose, image, ior, matrix in zip(poses, objects, frame.object_ior, frame.object_to_world, strict=False):
+        if image[..., 0].any():
+            size = np.linalg.norm(matrix[:, 0])
+            normal = image[..., 4:7].sum((0, 1)) / image[..., 0].sum()
+            pose[:] = np.concatenate([(matrix[:, :3] / size).ravel(), matrix[:, 3], [size, ior], normal])
+    return poses
 
 
 def frame_screen(frame: Frame) -> Screen:

@@ -101,6 +101,7 @@ def _render(stage: Stage, camera: Camera, share: np.ndarray, screen: int, spp: i
         direct=srgb(stage.direct(camera)).astype(np.float32),
         **stage.alone(camera),
         object_ior=np.array([b.ior for b in stage.scene.transparent], np.float32),
+        object_to_world=stage.object_to_world().astype(np.float32),
         **_landing(stage, camera),
         screen=colour,
         screen_depth=depth,

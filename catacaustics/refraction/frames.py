@@ -27,8 +27,8 @@ from catacaustics.shapes import Bool, Float, Int, UInt8
 SPLITS = ("train", "val", "test", "generator")
 """generator: frames without a path-traced reference, for the R-buffer generator, whose truth is cheap."""
 CARD = "card.json"
-FORMAT = 2
-"""Of data sets; 2 has the probe's panorama."""
+FORMAT = 3
+"""Of data sets; 2 has the probe's panorama, 3 how each transparent object stands."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +55,8 @@ class Frame:
     object_depth: Float[np.ndarray, "k h w"]
     object_ior: Float[np.ndarray, "k"]
     """Index of refraction."""
+    object_to_world: Float[np.ndarray, "k 3 4"]
+    """How each transparent object stands: x_world = M @ (x_body, 1), a rotation times a size, and a place."""
     refractive: Bool[np.ndarray, "h w"]
     """The first surface on the pixel's ray is transparent."""
     landing: Float[np.ndarray, "h w 3"]
@@ -100,6 +102,7 @@ _STORED = {
     "object_mask": bool,
     "object_depth": np.float16,
     "object_ior": np.float32,
+    "object_to_world": np.float32,
     "refractive": bool,
     "landing": np.float32,
     "landing_uv": np.float32,

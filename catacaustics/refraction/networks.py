@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import interpolate, normalize, relu, softplus
 
-from catacaustics.refraction.buffers import OBJECT_CHANNELS, Buffers
-from catacaustics.shapes import Float
+from catacaustics.refraction.buffers import Buffers
+from catacaustics.shapes import Bool, Float
 
 
 class Size(NamedTuple):
@@ -25,10 +25,19 @@ class Size(NamedTuple):
 SIZES = {"small": Size(16, 3, 4), "base": Size(32, 3, 6), "paper": Size(64, 4, 8)}
 
 
-def encode(values: Float[Tensor, "b c h w"], octaves: int) -> Float[Tensor, "b d h w"]:
+def encode(values: Float[Tensor, "*n c"], octaves: int) -> Float[Tensor, "*n d"]:
     """Positional encoding x, sin(2^i pi x), cos(2^i pi x), i < octaves; d = c (1 + 2 octaves)."""
     waves = [values * (torch.pi * 2**i) for i in range(octaves)]
-    return torch.cat([values, *(f(wave) for wave in waves for f in (torch.sin, torch.cos))], 1)
+    return torch.cat([values, *(f(wave) for wave in waves for f in (torch.sin, torch.cos))], -1)
+
+
+def _pixels(image: Float[Tensor, "*b c h w"]) -> Float[Tensor, "*b h w c"]:
+    """Channels last: there the layers that see one pixel at a time are fastest."""
+    return image.movedim(-3, -1).contiguous()
+
+
+def _image(pixels: Float[Tensor, "b h w c"]) -> Float[Tensor, "b c h w"]:
+    return pixels.movedim(-1, 1)
 
 
 def _join(*parts: Tensor) -> Tensor:
@@ -81,122 +90,236 @@ class UNet(nn.Module):
         return x
 
 
-class Guesses(NamedTuple):
-    """Directions of a ray in and behind an object, as far as its first surface tells; unit length."""
-
-    inside: Float[Tensor, "b 3 h w"]
-    ball: Float[Tensor, "b 3 h w"]
-    """Behind it, were the object a ball."""
-    sheet: Float[Tensor, "b 3 h w"]
-    """Behind it, were its back the mirror image of its front."""
-
-
 def refract(
-    directions: Float[Tensor, "b 3 h w"], normals: Float[Tensor, "b 3 h w"], ratio: Float[Tensor, "b 1 h w"]
-) -> Float[Tensor, "b 3 h w"]:
+    directions: Float[Tensor, "*n 3"], normals: Float[Tensor, "*n 3"], ratio: Float[Tensor, "*n 1"]
+) -> Float[Tensor, "*n 3"]:
     """Snell's law in vectors; `ratio` of the indices before and behind, normals against the ray. Beyond the critical
     angle the ray grazes the surface."""
-    cosine = -(directions * normals).sum(1, keepdim=True)
-    along = (1 - ratio**2 * (1 - cosine**2)).clamp_min(0).sqrt()
+    cosine = -(directions * normals).sum(-1, keepdim=True)
+    along = (1 - ratio**2 * (1 - cosine**2)).clamp_min(1e-9).sqrt()
     return ratio * directions + (ratio * cosine - along) * normals
 
 
-def exit_guesses(
-    rays: Float[Tensor, "b 3 h w"],
-    normal: Float[Tensor, "b 3 h w"],
-    ior: Float[Tensor, "b 1 h w"],
-    mean_normal: Float[Tensor, "b 3 h w"],
-) -> Guesses:
-    """Where rays go that meet a surface of this normal.
+def back_guesses(
+    inside: Float[Tensor, "*n 3"], normal: Float[Tensor, "*n 3"], mean_normal: Float[Tensor, "*n 3"]
+) -> tuple[Float[Tensor, "*n 3"], Float[Tensor, "*n 3"]]:
+    """Outward normals where a ray leaves a body, as far as the surface tells where it entered: were the body a ball, by
+    symmetry of the chord; were its back the mirror image of its front.
 
     Args:
-        ior: of the object; 0 where there is none: the ray goes on.
-        mean_normal: of the object's seen part, unit length.
+        inside: unit direction of the ray in the body.
+        normal: where it entered.
+        mean_normal: of the body's seen part, unit length.
     """
-    ior = torch.where(ior > 0, ior, 1.0)
-    inside = refract(rays, normal, 1 / ior)
-    # Outward normals where the ray leaves: a ball's, by symmetry of the chord, and the mirrored front's.
-    ball = normal - 2 * (inside * normal).sum(1, keepdim=True) * inside
-    sheet = normal - 2 * (normal * mean_normal).sum(1, keepdim=True) * mean_normal
-    return Guesses(inside, *(refract(inside, -back, ior) for back in (ball, sheet)))
+    ball = normal - 2 * (inside * normal).sum(-1, keepdim=True) * inside
+    return ball, normal - 2 * (normal * mean_normal).sum(-1, keepdim=True) * mean_normal
+
+
+_TURNS = 2
+"""Octaves of directions, and of how a ray passes a body's centre."""
+_SEGMENTS = 3
+"""Of a path in the nearest body: all but the last may end in a reflection."""
+_LEFT = 0.01
+"""A path of which less than this is still in the body is not followed on."""
+_SHARPNESS = 20.0
+"""How sharply light passes from reflection to refraction at the critical angle."""
+
+
+class Views(NamedTuple):
+    """The transparent objects as the pixels see them, in each body's own coordinates: how it bends rays does not change
+    when it is moved. Everything of an object that is nowhere seen is zero."""
+
+    features: Float[Tensor, "b k h w v"]
+    mask: Float[Tensor, "b k h w 1"]
+    depth: Float[Tensor, "b k h w 1"]
+    seen: Bool[Tensor, "b k 1 1 1"]
+    path: Float[Tensor, "b k h w 12"]
+    """Where the ray meets the body, its direction in it, normals there and on average."""
+    poses: Float[Tensor, "b k h w 14"]
+    """The first values of `Buffers.poses`."""
+
+
+def _view_channels(size: Size) -> int:
+    return 4 + 2 * 3 * (1 + 2 * size.octaves) + 3 * 3 * (1 + 2 * _TURNS) + 3 * 3
+
+
+def object_views(buffers: Buffers, octaves: int) -> Views:
+    """What the pixels see of every object; of bodies beside a pixel, how its ray passes them."""
+    objects, poses = _pixels(buffers.objects), buffers.poses[:, :, None, None]
+    mask, position, normal, depth = objects.split([1, 3, 3, 1, 1], -1)[:4]
+    rotation = buffers.poses[:, :, :9].unflatten(2, (3, 3))
+    center, size, ior, mean_normal = poses[..., 9:].split([3, 1, 1, 3], -1)
+    seen = size > 0
+    scale, refraction = torch.where(seen, size, 1.0), torch.where(seen, ior, 1.0)
+
+    def to_body(vectors: Tensor) -> Tensor:
+        with torch.autocast(vectors.device.type, enabled=False):  # geometry in float32
+            return (vectors.flatten(2, 3) @ rotation).unflatten(2, vectors.shape[2:4])
+
+    rays = _pixels(buffers.rays)[:, None].expand_as(position)
+    ray, normal_here = to_body(rays), to_body(normal)
+    mean_normal = to_body(normalize(mean_normal, dim=-1).expand_as(normal))
+    inside = torch.where(mask > 0, refract(ray, normal_here, (1 / refraction).expand_as(mask)), ray)
+    at = to_body(position - center) / scale * mask
+    line = to_body(_pixels(buffers.position)[:, None] - center) / scale
+    passing = line - (line * ray).sum(-1, keepdim=True) * ray
+    channels = [
+        *(mask, depth, ior.expand_as(mask), size.expand_as(mask)),
+        *(encode(v, octaves) for v in (position, at)),
+        *(encode(v, _TURNS) for v in (ray, inside, passing)),
+        *(rays, normal, normal_here),
+    ]
+    path = torch.cat([at, inside, normal_here, mean_normal], -1)
+    every = poses[..., :14].expand(-1, -1, *mask.shape[2:4], -1)
+    return Views(torch.cat(channels, -1) * seen, mask, depth, seen, path * seen, every)
 
 
 class ObjectEncoder(nn.Module):
     """Sum over the transparent objects of one shared network's features (GlassNet: k(sum h(x_k))).
 
-    The features are multiplied by the object's mask: order, and objects that are nowhere seen, do not matter.
+    Order, and objects that are nowhere seen, do not matter.
     """
 
     def __init__(self, size: Size):
         super().__init__()
-        self.octaves = size.octaves
-        inputs = OBJECT_CHANNELS + 3 * 2 * size.octaves + 3 + 3 * 3 + 3 * 5 + 3
-        self.first, self.second = _conv(inputs, 3 * size.width, 1), _conv(3 * size.width, size.width, 1)
+        self.layers = _layers(_view_channels(size), 3 * size.width, size.width)
 
-    def forward(self, buffers: Buffers) -> Float[Tensor, "b c h w"]:
-        b, k = buffers.objects.shape[:2]
-        objects, poses = buffers.objects.flatten(0, 1), buffers.poses.flatten(0, 1)[..., None, None]
-        mask, position, normal, ior = objects[:, :1], objects[:, 1:4], objects[:, 4:7], objects[:, 8:]
-        rays = buffers.rays.repeat_interleave(k, 0)
-        mean_normal = normalize(poses[:, 3:], dim=1).expand_as(normal)
-        guesses = exit_guesses(rays, normal, ior, mean_normal)
-        own = encode(4 * (position - poses[:, :3]), 2)  # where on the object
-        x = _join(mask, encode(position, self.octaves), objects[:, 4:], rays, *guesses, own, mean_normal)
-        x = relu(self.second(relu(self.first(x)))) * mask
+    def forward(self, views: Views) -> Float[Tensor, "b h w c"]:
+        x = self.layers(views.features) * views.seen
         # Summed in float64: rounding then depends on the order only far below float32's last digit.
-        return x.unflatten(0, (b, k)).sum(1, dtype=torch.float64).to(x.dtype)
+        return x.sum(1, dtype=torch.float64).to(x.dtype)
 
 
-def nearest_object(buffers: Buffers) -> tuple[Float[Tensor, "b 9 h w"], Float[Tensor, "b 3 h w"]]:
-    """Each pixel's nearest transparent object: its buffers, zero where there is none, and its unit mean normal."""
-    objects = buffers.objects
-    depth = torch.where(objects[:, :, 0] > 0, objects[:, :, 7], torch.inf)
-    index = depth.argmin(1)
-    nearest = torch.take_along_dim(objects, index[:, None, None], 1)[:, 0]
-    normals = normalize(buffers.poses[:, :, 3:], dim=2)[..., None, None]
-    return nearest, torch.take_along_dim(normals, index[:, None, None], 1)[:, 0] * nearest[:, :1]
+class Rows(NamedTuple):
+    """The n pixels that show glass, each with its nearest object."""
+
+    covered: Bool[Tensor, "b h w"]
+    features: Float[Tensor, "n v"]
+    path: Float[Tensor, "n 12"]
+    poses: Float[Tensor, "n 14"]
+
+
+def nearest_rows(views: Views) -> Rows:
+    """The object whose surface comes first."""
+    index = torch.where(views.mask > 0, views.depth, torch.inf).argmin(1, keepdim=True)
+    covered = (views.mask > 0).any(1)[..., 0]
+
+    def own(values: Tensor) -> Tensor:
+        return torch.gather(values, 1, index.expand(-1, -1, -1, -1, values.shape[-1]))[:, 0][covered]
+
+    return Rows(covered, own(views.features), own(views.path), own(views.poses))
+
+
+class Segment(nn.Module):
+    """A ray's way through a body to the next surface, in the body's coordinates, and what becomes of it there.
+
+    How far it is, and how the surface stands where that leads, is learned; how the ray is bent then follows from
+    Snell's law, past the critical angle by reflection, but for what the network adds.
+    """
+
+    def __init__(self, context: int, size: Size):
+        super().__init__()
+        self.octaves, inside = size.octaves, 4 * size.width
+        place, turn = 3 * (1 + 2 * size.octaves), 3 * (1 + 2 * _TURNS)
+        self.length = _layers(context + place + turn + 3, inside, inside)
+        self.onwards = _flat(inside, [-1.0, 0.0, 0.0, 0.0, 0.0])
+        self.surface = _layers(context + place + 6, inside, inside)
+        self.normal = _flat(inside, [0.5, 0.5, 0.0, 0.0, 0.0])
+
+    def forward(self, context: Tensor, path: Tensor, ior: Tensor, within: Tensor) -> tuple[Tensor, Tensor]:
+        """The path at its next surface (n 12, as Views.path) and how much of the ray is still in the body (n 1)."""
+        at, direction, normal, mean_normal = path.split(3, -1)
+        x = self.length(torch.cat([context, encode(at, self.octaves), encode(direction, _TURNS), normal], -1))
+        length, leaning, more = _precise(self.onwards, x).split([1, 1, 3], -1)
+        at = at + within * softplus(length) * direction
+        ball, sheet = back_guesses(direction, normal, mean_normal)
+        x = self.surface(torch.cat([context, encode(at, self.octaves), ball, sheet], -1))
+        shares, correction = _precise(self.normal, x).split([2, 3], -1)
+        back = normalize(shares[:, :1] * ball + shares[:, 1:] * sheet + correction, dim=-1)
+        cosine = (direction * back).sum(-1, keepdim=True)
+        leaves = torch.sigmoid(_SHARPNESS * (1 - ior**2 * (1 - cosine**2)) + leaning)
+        mirrored = direction - 2 * cosine * back
+        bent = leaves * refract(direction, -back, ior) + (1 - leaves) * mirrored + more
+        direction = normalize(within * bent + (1 - within) * direction, dim=-1)
+        return torch.cat([at, direction, back, mean_normal], -1), within * (1 - leaves)
 
 
 class Generator(nn.Module):
     """R-buffer generator: objects and opaque geometry in, `outputs` channels of normals, coordinates, logits out.
 
-    World coordinates, channels 3 to 5 with `world`, are found as first surface + distance * direction: how a ray is
-    bent is a smooth function that knows nothing of the scene behind, unlike the point where it lands. The direction is
-    a mixture of the ray and the guesses of `exit_guesses`, plus what the network adds.
+    A ray is followed through the nearest body, segment by segment; from where it leaves the body it goes
+    distance * direction, to a point in the world. How rays are bent is a smooth function that knows nothing of the
+    scene behind, unlike the point where they land. The point is channels 3 to 5 of the output; the last layers turn it
+    into other coordinates, where there are any. Zero where there is no glass.
 
     Args:
-        outputs: channels.
-        world: whether there are world coordinates.
+        outputs: channels, 6 or more.
     """
 
-    def __init__(self, outputs: int, size: Size, world: bool):
+    def __init__(self, outputs: int, size: Size):
         super().__init__()
-        self.octaves, self.world = size.octaves, world
+        self.octaves, self.outputs = size.octaves, outputs
         self.objects = ObjectEncoder(size)
-        self.trunk = UNet(size.width + 3 * (1 + 2 * size.octaves) + 3 + 1 + 4 * 3, size)
-        # How rays bend is a function of the pixel's own surface: most of the capacity is here, which costs little.
-        inside = 3 * size.width
-        first, second = _conv(2 * size.width + 4 * 3, inside, 1), _conv(inside, inside, 1)
-        self.head = nn.Sequential(first, nn.ReLU(), second, nn.ReLU())
-        # At the start the ray goes straight on.
-        bias = [0.0] * outputs + [0.5, 1.0, 0.0, 0.0, 0.0] * world
-        self.last = _biased(nn.Conv2d(inside, len(bias), 1), bias)
-        self.last.weight.data *= 0.1
+        self.trunk = UNet(size.width + 3 * (1 + 2 * size.octaves) + 3 + 1 + 3, size)
+        inside, place = 4 * size.width, 3 * (1 + 2 * size.octaves)
+        self.context = _layers(2 * size.width + _view_channels(size), inside, 2 * size.width)
+        self.segment = Segment(2 * size.width, size)
+        self.reach = _layers(2 * size.width + place + 3 * (1 + 2 * _TURNS) + 1, inside, inside)
+        self.leave = _flat(inside, [0.5, 0.0, 0.0, 0.0])
+        self.last = _flat(inside, [0.0] * 3)
+        self.land = _layers(inside + place, inside, inside) if outputs > 6 else None
+        self.other = _flat(inside, [0.0] * (outputs - 6)) if outputs > 6 else None
 
     def forward(self, buffers: Buffers) -> Float[Tensor, "b outputs h w"]:
-        objects = self.objects(buffers)
-        nearest, mean_normal = nearest_object(buffers)
-        guesses = exit_guesses(buffers.rays, nearest[:, 4:7], nearest[:, 8:], mean_normal)
-        ways = [buffers.rays, *guesses]
-        geometry = [encode(buffers.position, self.octaves), buffers.normal, buffers.depth]
-        x = self.trunk(_join(objects, *geometry, *ways))
-        x = _precise(self.last, self.head(_join(x, objects, *ways)))
-        if not self.world:
-            return x
-        x, distance, shares = x[:, :-5], softplus(x[:, -5:-4]), x[:, -4:]
-        bent = sum(share * way for share, way in zip(shares.split(1, 1), ways, strict=True))
-        landing = nearest[:, 1:4] + distance * normalize(bent + x[:, 3:6], dim=1)
-        return torch.cat([x[:, :3], landing], 1)
+        views = object_views(buffers, self.octaves)
+        objects, rows = self.objects(views), nearest_rows(views)
+        position, normal, depth, rays = (
+            _pixels(v) for v in (buffers.position, buffers.normal, buffers.depth, buffers.rays)
+        )
+        geometry = [encode(position, self.octaves), normal, depth, rays]
+        x = self.trunk(_image(torch.cat([objects, *geometry], -1)))
+        around = torch.cat([_pixels(x), objects], -1)[rows.covered]
+        x = self.context(torch.cat([around, rows.features], -1))
+        path, within = self._follow(x, rows.path, rows.poses[:, 13:14])
+        rotation = rows.poses[:, :9].unflatten(1, (3, 3))
+        start = rows.poses[:, 9:12] + rows.poses[:, 12:13] * (rotation * path[:, None, :3]).sum(-1)
+        direction = (rotation * path[:, None, 3:6]).sum(-1)
+        x = self.reach(torch.cat([x, encode(start, self.octaves), encode(direction, _TURNS), within], -1))
+        distance, more = _precise(self.leave, x).split([1, 3], -1)
+        landing = start + softplus(distance) * normalize(direction + more, dim=-1)
+        found = torch.cat([_precise(self.last, x), landing], -1)
+        if self.land is not None and self.other is not None:
+            x = self.land(torch.cat([x, encode(landing, self.octaves)], -1))
+            found = torch.cat([found, _precise(self.other, x)], -1)
+        whole = found.new_zeros(*rows.covered.shape, self.outputs)
+        whole[rows.covered] = found
+        return _image(whole)
+
+    def _follow(self, context: Tensor, path: Tensor, ior: Tensor) -> tuple[Tensor, Tensor]:
+        """The path where it leaves the body, and how much of it has not left."""
+        path, within = self.segment(context, path, ior, torch.ones_like(ior))
+        for _ in range(_SEGMENTS - 1):
+            on = (within[:, 0] > _LEFT).nonzero()[:, 0]
+            own = self.segment(context[on], path[on], ior[on], within[on])
+            path, within = (a.index_copy(0, on, b) for a, b in zip((path, within), own, strict=True))
+        return path, within
+
+
+def _layers(inputs: int, width: int, outputs: int) -> nn.Sequential:
+    """Two layers that see one pixel at a time."""
+    layers = [nn.Linear(inputs, width), nn.Linear(width, outputs)]
+    for layer in layers:
+        nn.init.kaiming_normal_(layer.weight, nonlinearity="relu")
+        nn.init.zeros_(layer.bias)
+    return nn.Sequential(layers[0], nn.ReLU(), layers[1], nn.ReLU())
+
+
+def _flat(inputs: int, bias: list[float]) -> nn.Linear:
+    """A layer that at the start gives about its bias."""
+    layer = nn.Linear(inputs, len(bias))
+    layer.weight.data *= 0.1
+    layer.bias.data = torch.tensor(bias)
+    return layer
 
 
 class Renderer(nn.Module):
@@ -220,9 +343,11 @@ class Renderer(nn.Module):
 
     def forward(self, buffers: Buffers, r_buffer: Float[Tensor, "b r h w"]) -> Float[Tensor, "b 3 h w"]:
         """RGB, sRGB-encoded, not clamped. The first three channels of the R-buffer are its colour."""
-        geometry = [encode(buffers.position, self.octaves), buffers.normal, buffers.depth, buffers.rays]
+        place = _image(encode(_pixels(buffers.position), self.octaves))
+        geometry = [place, buffers.normal, buffers.depth, buffers.rays]
         code = self.reflection(_join(*geometry, buffers.albedo, buffers.direct))
-        through = self.transmission(_join(code, self.objects(buffers), r_buffer))
+        objects = _image(self.objects(object_views(buffers, self.octaves)))
+        through = self.transmission(_join(code, objects, r_buffer))
         out = _precise(self.last, relu(self.join(_join(code, through, r_buffer))))
         image = out[:, :3] + out[:, 3:6] * buffers.direct
         return image + out[:, 6:9] * r_buffer[:, :3] if self.r_channels else image

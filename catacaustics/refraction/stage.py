@@ -88,6 +88,13 @@ def _pose(body: Body, bodies: Mapping[str, Body]) -> Pose:
     return Pose(tuple(center.tolist()), tuple(map(tuple, rotation.tolist())), size)
 
 
+def poses(scene: Scene) -> Float[np.ndarray, "k 3 4"]:
+    """How every transparent body of a drawn scene stands: x_world = M @ (x_body, 1)."""
+    named = {b.name: b for b in scene.bodies}
+    found = [_pose(b, named) for b in scene.transparent]
+    return np.array([np.column_stack([p.size * np.array(p.rotation), p.center]) for p in found]).reshape(-1, 3, 4)
+
+
 @lru_cache(maxsize=32)
 def _texture(body_texture: Any) -> UInt8[np.ndarray, "_ _ 3"]:
     return body_texture()
@@ -295,6 +302,10 @@ class Stage:
         colour = [_encoded(c) for c in hit.bsdf().eval_diffuse_reflectance(hit)]
         image = np.stack([np.array(c) for c in colour], -1).reshape(rows, 2 * rows, 3)
         return np.round(255 * np.clip(image, 0, 1)).astype(np.uint8), center.astype(np.float32)
+
+    def object_to_world(self) -> Float[np.ndarray, "k 3 4"]:
+        """How every transparent body stands: x_world = M @ (x_body, 1)."""
+        return poses(self.scene)
 
     def alone(self, camera: Camera) -> dict[str, np.ndarray]:
         """Every transparent body as if it stood alone: object_mask, object_position, object_normal, object_depth."""

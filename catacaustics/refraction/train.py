@@ -64,6 +64,8 @@ class _Part:
     indices: range
     """Frames to draw from."""
     rate: float
+    batch: int
+    crop: int
     minutes: float | None
     losses: Callable[[Buffers, list[Place]], dict[str, Tensor]]
     bfloat16: bool
@@ -95,7 +97,8 @@ def train(config: RefractTrainConfig) -> RefractionModel:
     if model.generator is not None and config.part != "renderer" and config.generator is None:
         every = range(len(train_frames) + len(more))
         minutes = config.minutes and config.minutes * share
-        part = _Part("generator", every, config.lr_generator, minutes, _generator_step(model, config), short)
+        sizes, step = (config.batch_generator, config.crop_generator), _generator_step(model, config)
+        part = _Part("generator", every, config.lr_generator, *sizes, minutes, step, short)
         _fit(model.generator, part, cache, model, config)
     if config.part != "generator":
         if model.generator is not None:
@@ -105,7 +108,7 @@ def train(config: RefractTrainConfig) -> RefractionModel:
         minutes = config.minutes and config.minutes * (1 - share)
         every = range(len(train_frames))
         step = _renderer_step(model, _baked(model, cache, every, config), config)
-        part = _Part("renderer", every, config.lr_renderer, minutes, step, short)
+        part = _Part("renderer", every, config.lr_renderer, config.batch, config.crop, minutes, step, short)
         _fit(model.renderer, part, cache, model, config)
     return model.eval()
 
@@ -121,7 +124,8 @@ def computes_bfloat16(device: torch.device) -> bool:
 def _check(config: RefractTrainConfig, frames: Frames) -> None:
     run = Path(config.run)
     side = int(frames.card["resolution"])
-    check_layout(Layout.of(frames), config.size, frames, min(config.crop, side) or side)
+    for crop in (config.crop, config.crop_generator):
+        check_layout(Layout.of(frames), config.size, frames, min(crop, side) or side)
     if not len(frames.split("train")):
         raise UserError(f"{config.data} has no training frames.", "one or more", "make them: --train of refract data")
     if config.part == "generator" and (kind_of(config.model) is None or config.coordinates == "true"):
@@ -162,7 +166,13 @@ def _generator_step(
     kind, generator = model.kind, model.generator
     assert generator is not None
     assert kind is not None
-    weights = LossWeights(config.weight_coordinates, config.weight_tv, config.weight_index, config.weight_normal)
+    weights = LossWeights(
+        config.weight_coordinates,
+        config.weight_tv,
+        config.weight_index,
+        config.weight_normal,
+        config.weight_direction,
+    )
 
     def losses(batch: Buffers, places: list[Place]) -> dict[str, Tensor]:
         return generator_losses(kind, split_output(kind, generator(batch)), batch, weights)
@@ -319,24 +329,24 @@ def _draw(step: int, part: _Part, cache: BufferCache, config: RefractTrainConfig
     crops, places = [], []
     part_seed = [config.seed, int(part.name == "renderer")]
     rng = np.random.default_rng([*part_seed, 0, step])
-    for draw in range(step * config.batch, (step + 1) * config.batch):
+    for draw in range(step * part.batch, (step + 1) * part.batch):
         epoch, place = divmod(draw, len(part.indices))
         index = int(np.random.default_rng([*part_seed, 1, epoch]).permutation(part.indices)[place])
         whole = cache.get(index)
-        y, x, side = _choose_crop(whole, config, rng)
+        y, x, side = _choose_crop(whole, part.crop, config.glass_share, rng)
         crops.append(whole.crop(y, x, side))
         places.append((index, y, x))
     return stack(crops), places
 
 
-def _choose_crop(whole: Buffers, config: RefractTrainConfig, rng: np.random.Generator) -> Place:
+def _choose_crop(whole: Buffers, crop: int, glass_share: float, rng: np.random.Generator) -> Place:
     """First row, first column and side: around a refractive pixel, or anywhere."""
     full = whole.depth.shape[-1]
-    side = min(config.crop, full) or full
+    side = min(crop, full) or full
     if side == full:
         return 0, 0, side
     glass = whole.refractive[0, 0].flatten().nonzero()
-    if len(glass) and rng.random() < config.glass_share:
+    if len(glass) and rng.random() < glass_share:
         pixel = int(glass[rng.integers(len(glass))])
         y, x = (min(max(at - side // 2, 0), full - side) for at in divmod(pixel, full))
         return y, x, side
