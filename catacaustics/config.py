@@ -132,19 +132,16 @@ class TrainConfig:
     lr_opacity: float = 0.2
     lr_features: float = 2.5e-2
     lr_environment: float = 5e-4
-    """Of the environment map's features, which start from what photographs show where the cloud is open. A texel is
-    seen by few of them and through gaps: with the rate of points it learns noise."""
+    """Of the environment map's features: seen by few photographs, they learn noise at the rate of points."""
     lr_final_share: float = 0.1
     """Rates of normals, footprints, opacities, features and the environment map decay to this share of their start."""
     lr_network: float = 1e-3
     lr_network_final: float = 1e-4
     warp_weight_decay: float = 1e-2
     guesses: bool | None = None
-    """Start from stereo's guesses, too, where no three views agree. Left out: no, or as a trial decides for a model of
-    auto."""
+    """Start from stereo's guesses, too. Left out: no, or as a trial decides where a model is auto."""
     refine_poses: bool | None = None
-    """Learn small corrections of the training cameras' poses. Left out: no, or as trials decide where a model is auto
-    and there are 30 minutes or more."""
+    """Learn corrections of the training poses. Left out: no, or as trials of 30 minutes and more decide."""
     exposure: bool | None = None
     """Learn exposure and white balance (three gains) of each training photograph; left out, as refine_poses."""
     lr_pose: float = 1e-3
