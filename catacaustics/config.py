@@ -7,7 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-Model = Literal["auto", "none", "static", "plane", "sphere", "ellipsoid", "concave", "neural", "quadric+neural"]
+Model = Literal[
+    "auto", "none", "static", "plane", "sphere", "ellipsoid", "revolution", "concave", "neural", "quadric+neural"
+]
 """Rungs of the ladder of warps (reflectors/warps.py); auto chooses by trials, none trains the primary cloud alone."""
 
 CameraPath = Literal["held-out", "spline", "still"]
@@ -55,8 +57,7 @@ class SplatConfig:
     pair_budget: int = 4_000_000
     """PyTorch only: splat-pixel pairs held at a time, about 60 bytes each; results do not depend on it."""
     deterministic: bool = False
-    """GPU only: gradients are the same bit for bit in every run, for more memory and time (on the CPU they always
-    are)."""
+    """GPU only: gradients are the same bit for bit in every run, as always on the CPU, for more memory and time."""
 
     @classmethod
     def exact(cls, **settings: float) -> "SplatConfig":
@@ -80,7 +81,7 @@ class TrainConfig:
     """Folder to write: scene.safetensors, checkpoint, metrics.jsonl, report.html."""
     model: tuple[Model, ...] = ("auto",)
     """What a reflector is: one name for all, or one for each in order of their names. auto chooses by short trials,
-    none trains the primary cloud alone; concave is an ellipsoid seen from inside."""
+    none trains the primary cloud alone; concave is an ellipsoid seen from inside, revolution any turned shape."""
     resume: bool = False
     """Go on from the run's last checkpoint."""
     iterations: int = 30_000
@@ -277,8 +278,7 @@ class CloneConfig:
     box: tuple[float, float, float, float, float, float] | None = None
     """Copy the primary points between these corners (x y z x y z) instead of those in the reflection volume."""
     surroundings: Literal["moved", "resting"] = "moved"
-    """moved: the copy mirrors what the original mirrors, as if its surroundings had come along; resting: it mirrors the
-    surroundings from where it stands, as a real mirror would (plane, sphere, ellipsoid, concave)."""
+    """moved: as if its surroundings had come along; resting: as a real mirror would where it stands."""
     reflector: str | None = None
     """Name of the reflector, where there are several."""
     device: Literal["auto", "cpu", "cuda"] = "auto"
@@ -384,7 +384,7 @@ class ReconstructConfig:
     """Reflector masks at the size of the photographs: MASKS/REFLECTOR/STEM.png, white = reflector."""
     model: tuple[Model, ...] = ("auto",)
     """What a reflector is: one name for all, or one for each in order of their names. auto chooses by short trials,
-    none trains the primary cloud alone; concave is an ellipsoid seen from inside."""
+    none trains the primary cloud alone; concave is an ellipsoid seen from inside, revolution any turned shape."""
     iterations: int = 30_000
     """Optimiser steps at most."""
     minutes: float | None = None

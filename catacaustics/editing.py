@@ -137,7 +137,7 @@ def _moved_warp(
         raise UserError(
             f"The reflections of {scene.volumes[index].name} cannot be seen from another place "
             f"({type(inner_warp(warp)).__name__}{', edited' if inner_warp(warp) is not warp else ''}).",
-            "a plane, sphere, ellipsoid or concave model, not edited before",
+            "a plane, sphere, ellipsoid, revolution or concave model, not edited before",
             "leave --surroundings at moved: the copy then mirrors what the original mirrors",
         )
     return mirror
@@ -222,7 +222,7 @@ def replace_surroundings(
     if isinstance(inner, NeuralWarp | StaticWarp):
         raise UserError(
             f"The reflections of {scene.volumes[index].name} do not know what they mirror ({type(inner).__name__}).",
-            "a plane, sphere, ellipsoid, concave or quadric+neural model",
+            "a plane, sphere, ellipsoid, revolution, concave or quadric+neural model",
             "train with one of these models",
         )
     edited = copy.deepcopy(scene)

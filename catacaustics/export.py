@@ -14,8 +14,9 @@ from catacaustics.config import ExportConfig
 from catacaustics.files import atomic_path, write_json
 from catacaustics.geometry import hull_mesh, rigid_inverse
 from catacaustics.points import PointCloud, write_mesh, write_ply, write_tables
+from catacaustics.reflectors.revolution import Revolution, profile
 from catacaustics.reflectors.volume import ReflectionVolume
-from catacaustics.reflectors.warps import PlaneWarp, QuadricWarp, mirror_of
+from catacaustics.reflectors.warps import Mirror, QuadricWarp, RevolutionWarp, mirror_of
 from catacaustics.run import named_view, open_run
 from catacaustics.scene import PointParameters, Scene
 from catacaustics.shapes import Float, Int
@@ -105,12 +106,26 @@ def sphere_mesh(subdivisions: int = 4) -> tuple[Float[np.ndarray, "v 3"], Int[np
     return vertices, faces
 
 
-def mirror_mesh(
-    mirror: PlaneWarp | QuadricWarp, volume: ReflectionVolume
+def _turned_mesh(
+    surface: Revolution, rings: int = 65, sides: int = 64
 ) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
-    """The surface of a fitted mirror as triangles: a whole ellipsoid, or the plane's part inside the volume (where it
-    misses the volume, the volume's shadow on it)."""
+    z = torch.linspace(float(surface.ends[0]), float(surface.ends[1]), rings).to(surface.ends)
+    radius = profile(surface, z)[0].clamp_min(0).sqrt()[:, None]
+    angle = 2 * torch.pi * torch.arange(sides) / sides
+    local = [radius * angle.cos().to(z), radius * angle.sin().to(z), z[:, None].expand(-1, sides)]
+    vertices = surface.center + torch.stack(local, -1).reshape(-1, 3) @ surface.frame.T
+    ring, side = np.meshgrid(np.arange(rings - 1) * sides, np.arange(sides), indexing="ij")
+    a, b = (ring + side).ravel(), (ring + (side + 1) % sides).ravel()
+    faces = np.concatenate([np.stack([a, b, b + sides], 1), np.stack([a, b + sides, a + sides], 1)])
+    return vertices.cpu().numpy().astype(np.float64), faces
+
+
+def mirror_mesh(mirror: Mirror, volume: ReflectionVolume) -> tuple[Float[np.ndarray, "v 3"], Int[np.ndarray, "f 3"]]:
+    """The surface of a fitted mirror as triangles: a whole ellipsoid, a surface of revolution between its ends, or the
+    plane's part inside the volume (where it misses the volume, the volume's shadow on it)."""
     with torch.no_grad():
+        if isinstance(mirror, RevolutionWarp):
+            return _turned_mesh(mirror.surface())
         if isinstance(mirror, QuadricWarp):
             center, axes = (t.cpu().numpy().astype(np.float64) for t in mirror.shape())
             vertices, faces = sphere_mesh()

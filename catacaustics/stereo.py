@@ -17,7 +17,8 @@ from catacaustics.config import StereoConfig
 from catacaustics.errors import UserError
 from catacaustics.files import write_json
 from catacaustics.images import write_image
-from catacaustics.reflectors.warps import PlaneWarp, mirror_of
+from catacaustics.reflectors.revolution import Revolution, ray_distances
+from catacaustics.reflectors.warps import PlaneWarp, RevolutionWarp, mirror_of
 from catacaustics.run import named_view, open_run, scene_file
 from catacaustics.scene import ReflectionDisks, RenderOutput, Scene
 from catacaustics.shapes import Float
@@ -185,6 +186,12 @@ def surface_depth(
         normal, distance = (_float64(t) for t in mirror.plane())
         with np.errstate(divide="ignore"):
             depth = (distance - normal @ start) / (rays @ normal)
+    elif isinstance(mirror, RevolutionWarp):
+        lengths = np.linalg.norm(rays, axis=-1, keepdims=True)
+        surface = Revolution(*(value.detach().cpu().double() for value in mirror.surface()))
+        flat = torch.from_numpy((rays / lengths).reshape(-1, 3))
+        depth = ray_distances(surface, torch.from_numpy(start), flat).numpy().reshape(lengths.shape[:-1])
+        depth = depth / lengths[..., 0]
     else:
         center, axes = (_float64(t) for t in mirror.shape())
         inverse = np.linalg.inv(axes)

@@ -13,7 +13,8 @@ from catacaustics.capture.importers import import_capture
 from catacaustics.editing import clone_reflector
 from catacaustics.export import mirror_mesh, point_colors, sphere_mesh, write_gaussians
 from catacaustics.points import read_ply
-from catacaustics.reflectors.warps import PlaneWarp, QuadricWarp, mirror_of
+from catacaustics.reflectors.revolution import Revolution
+from catacaustics.reflectors.warps import PlaneWarp, QuadricWarp, RevolutionWarp, mirror_of
 from catacaustics.splatting import splat_points
 
 
@@ -149,6 +150,20 @@ def test_the_mesh_of_an_ellipsoid_lies_on_it_also_after_cloning(scene):
     old, _ = mirror_mesh(mirror_of(scene.warps[0]), scene.volumes[0])
     center = scene.volumes[0].center
     np.testing.assert_allclose(copy, center + 0.5 * (old - center) + shift, atol=1e-5)
+
+
+def test_the_mesh_of_a_turned_mirror_encloses_what_its_profile_does(scene):
+    # A cone: q = (1 - z)^2 / 4 between z = -1 and its tip, by the polar form of a quadratic spline.
+    cell, z = 2 / 5, -1 + 2 / 5 * (torch.arange(8) - 1)
+    squared = (1 - 2 * z + z * z - cell**2 / 3) / 4
+    center = torch.tensor([1.0, 2, 3])
+    cone = Revolution(center, torch.eye(3), torch.ones(3), torch.tensor([-1.0, 1.0]), squared)
+    vertices, faces = mirror_mesh(RevolutionWarp(cone), scene.volumes[0])
+    local = vertices - center.numpy()
+    np.testing.assert_allclose(np.linalg.norm(local[:, :2], axis=1), (1 - local[:, 2]) / 2, atol=1e-3)
+    # Seen from the middle of the open bottom, which adds nothing.
+    a, b, c = np.moveaxis(local[faces] - [0, 0, -1], 1, 0)
+    assert np.einsum("ij,ij->i", a, np.cross(b, c)).sum() / 6 == pytest.approx(2 / 3 * np.pi, rel=0.01)
 
 
 def test_the_mesh_of_a_plane_is_its_part_in_the_volume(scene):

@@ -8,7 +8,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from catacaustics.reflectors.quadric import specular_points, sphere_angle, tilted_disks
+from catacaustics.reflectors.fermat import tilted_disks
+from catacaustics.reflectors.quadric import specular_points, sphere_angle
 
 CENTER = torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)
 RADII = {"sphere": (0.5, 0.5, 0.5), "ellipsoid": (0.5, 0.3, 0.7), "pancake": (0.8, 0.8, 0.2)}

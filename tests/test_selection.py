@@ -1,6 +1,7 @@
 """Model selection: the rule, and the choice on a capture whose answer is known."""
 
 import json
+import shutil
 from unittest import mock
 
 import numpy as np
@@ -58,7 +59,7 @@ def chosen(tmp_path_factory):
     config = TrainConfig(
         capture, root / "run", iterations=10, image_size=64, environment_width=20, warp_width=16, refine_poses=False
     )
-    with mock.patch.object(mirrors, "_SHAPE_STEPS", 3):
+    with mock.patch.object(mirrors, "_SHAPE_STEPS", 3), mock.patch.object(selection, "is_turned", return_value=True):
         train(config)
     return config, json.loads((root / "run" / "model_choice.json").read_text())
 
@@ -88,6 +89,7 @@ def test_a_choice_once_made_is_not_made_again(chosen, monkeypatch, capsys):
     config, choice = chosen
     (config.run / "scene.safetensors").unlink()
     (config.run / "checkpoint.safetensors").unlink()
+    monkeypatch.setattr(selection, "is_turned", lambda volume, capture: True)
     train(config)
     assert "model selection: model," not in capsys.readouterr().out
     assert json.loads((config.run / "model_choice.json").read_text()) == choice
@@ -128,8 +130,21 @@ def test_a_short_training_does_not_try_networks_and_says_so(choose, capsys):
     assert chosen.model == ("sphere",)
     assert ("plane", 1) in tried
     assert not {"neural", "quadric+neural"} & {name for name, _ in tried}
-    assert "neural and quadric+neural are not tried" in capsys.readouterr().out
-    assert "Not tried" in (chosen.run / "model_choice.html").read_text()
+    said, page = capsys.readouterr().out, (chosen.run / "model_choice.html").read_text()
+    for network in ("neural", "quadric+neural"):
+        assert f"{network} is not tried: takes more than 30 minutes" in said
+        assert f"{network} (takes more than 30 minutes)" in page
+
+
+def test_a_surface_of_revolution_is_tried_only_where_the_masks_show_one(choose, capsys, monkeypatch):
+    chosen, tried = choose(lambda *_: 20.0)
+    assert "revolution" not in {name for name, _ in tried}
+    assert "revolution is not tried: the masks show an ellipsoid" in capsys.readouterr().out
+    shutil.rmtree(chosen.run)
+    monkeypatch.setattr(selection, "is_turned", lambda volume, capture: True)
+    chosen, tried = choose(lambda name, _: 25.0 if name == "revolution" else 20.0)
+    assert ("revolution", 1) in tried
+    assert chosen.model == ("revolution",)
 
 
 @pytest.mark.parametrize("gain", [-1.0, 0.1, 1.0])

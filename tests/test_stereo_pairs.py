@@ -10,8 +10,10 @@ from toy import BALL_CENTER, BALL_RADIUS, ball_mask, scene_of, write_run
 
 from catacaustics import cli
 from catacaustics.cameras import pixel_centers
+from catacaustics.geometry import normalize
 from catacaustics.images import read_image
-from catacaustics.reflectors.warps import PlaneWarp, QuadricWarp
+from catacaustics.reflectors.fit import fit_revolution
+from catacaustics.reflectors.warps import PlaneWarp, QuadricWarp, RevolutionWarp
 from catacaustics.stereo import (
     Rig,
     anaglyph,
@@ -109,6 +111,16 @@ def test_the_depth_of_a_balls_surface_is_the_closed_forms(mirror_ball, camera):
     np.testing.assert_allclose(np.linalg.norm(points - BALL_CENTER, axis=1), BALL_RADIUS, rtol=1e-6)
     toward = np.einsum("ij,ij->i", points - BALL_CENTER, points - camera.center)
     assert (toward < 0).all()  # the side that faces the camera
+
+
+def test_the_depth_of_a_turned_surface_is_that_of_the_ball_it_is(mirror_ball, camera):
+    turned, ball = copy.deepcopy(mirror_ball), surface_depth(mirror_ball, 0, camera, pixel_centers(camera.viewport))
+    points = BALL_CENTER + BALL_RADIUS * normalize(np.random.default_rng(0).normal(size=(2000, 3)))
+    turned.warps[0] = RevolutionWarp(fit_revolution(points, BALL_CENTER, BALL_RADIUS * np.eye(3))[0]).float()
+    depth = surface_depth(turned, 0, camera, pixel_centers(camera.viewport))
+    both = np.isfinite(depth) & np.isfinite(ball)
+    assert both.sum() > 0.95 * np.isfinite(ball).sum()
+    np.testing.assert_allclose(depth[both], ball[both], atol=0.02 * BALL_RADIUS)
 
 
 def test_where_a_rung_has_no_mirror_its_volume_is_the_surface(capture, camera):

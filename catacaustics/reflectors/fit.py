@@ -1,12 +1,17 @@
-"""Where the learned mirrors start: planes, spheres and ellipsoids that touch a reflection volume from inside.
+"""Where the learned mirrors start: planes, spheres and ellipsoids that touch a reflection volume from inside,
+and bodies that most of a visual hull lies on.
 
 Each plane that bounds the volume was lifted from a mask's outline, so the reflector touches it: fits are to the planes,
 not to the volume's corners, which lie outside the reflector.
 """
 
 import numpy as np
+import torch
 
 from catacaustics.geometry import normalize, sphere_directions
+from catacaustics.reflectors.quadric import distances as distances_from_quadric
+from catacaustics.reflectors.revolution import Revolution
+from catacaustics.reflectors.revolution import distances as distances_from_revolution
 from catacaustics.reflectors.volume import ReflectionVolume
 from catacaustics.shapes import Float
 
@@ -18,6 +23,10 @@ BODY_SCALE = 0.03
 """Of the size of a body: points farther from it belong to something else."""
 _THINNEST = 0.1
 """A fitted radius below this share of the largest one is not believed."""
+PROFILE = 24
+"""Coefficients of the profile of a surface of revolution."""
+_STIFFNESS = 0.3
+"""Of the profile against bends that the points of a visual hull do not ask for."""
 
 
 def fit_plane(
@@ -128,6 +137,11 @@ def fit_ellipsoid(volume: ReflectionVolume) -> tuple[Float[np.ndarray, "3"], Flo
     return center + radius * np.array(shift), radius * vectors * np.sqrt(values)
 
 
+def body_loss(distances: Float[torch.Tensor, "n"]) -> Float[torch.Tensor, ""]:
+    """Cauchy's loss of distances of a visual hull's points from a body, in units of its size; differentiable."""
+    return torch.log1p((distances / BODY_SCALE) ** 2).mean()
+
+
 def fit_body(
     points: Float[np.ndarray, "n 3"],
     center: Float[np.ndarray, "3"],
@@ -157,10 +171,10 @@ def fit_body(
 
     def distances(x: np.ndarray) -> np.ndarray:
         middle, rotation, radii = body(x)
-        scaled = (points - middle) @ rotation / radii
-        norms = np.linalg.norm(scaled, axis=1)
-        return (norms - 1) * norms / np.maximum(np.linalg.norm(scaled / radii, axis=1), 1e-9) / size
+        shape = (torch.from_numpy(v) for v in (middle, rotation * radii))
+        return distances_from_quadric(cloud, *shape).numpy() / size
 
+    cloud = torch.from_numpy(points)
     starts = [np.r_[np.zeros(3 if sphere else 6), np.full(1 if sphere else 3, np.log(f))] for f in (1, 0.8, 0.6)]
     answers = [least_squares(distances, x, loss="cauchy", f_scale=BODY_SCALE, max_nfev=100) for x in starts]
     answer = min(answers, key=lambda a: a.cost)
@@ -191,6 +205,71 @@ def fit_bent_sheet(volume: ReflectionVolume) -> list[tuple[Float[np.ndarray, "3"
         center = middle + (heights[:, 2].max() - radius) * axes[2]
         found.append((center, np.stack([8 * half[along] * axes[along], radius * axes[across], radius * axes[2]], 1)))
     return found
+
+
+def fit_revolution(
+    points: Float[np.ndarray, "n 3"], center: Float[np.ndarray, "3"], axes: Float[np.ndarray, "3 3"]
+) -> tuple[Revolution, float]:
+    """The surface of revolution about one of an ellipsoid's axes that most points of a surface lie on, and its loss by
+    `body_loss`.
+
+    Least squares of first-order distances with Cauchy's loss, as `fit_body`; third differences of the profile are held
+    small, so that ellipsoids of revolution are free.
+
+    Args:
+        points: on the surface of a visual hull.
+        center, axes: of the ellipsoid that `fit_body` found.
+    """
+    from scipy.optimize import least_squares
+    from scipy.spatial.transform import Rotation
+
+    cloud, size = torch.from_numpy(points), float(np.linalg.norm(axes, axis=0).mean())
+    starts = [_coaxial(points, center, np.roll(axes, 2 - third, axis=1), size) for third in range(3)]
+    start = min(starts, key=lambda surface: _off(cloud, surface, size))
+
+    def moved(x: np.ndarray) -> Revolution:
+        tilt = torch.from_numpy(Rotation.from_rotvec([x[2], x[3], 0]).as_matrix())
+        return start._replace(
+            center=start.center + size * start.frame[:, :2] @ torch.from_numpy(x[:2]),
+            frame=start.frame @ tilt,
+            squared=start.squared + size**2 * torch.from_numpy(x[4:]),
+        )
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        surface = moved(x)
+        stiff = _STIFFNESS * len(points) ** 0.5 * np.diff(surface.squared.numpy(), 3) / size**2
+        return np.concatenate([distances_from_revolution(surface, cloud).numpy() / size, stiff])
+
+    answer = least_squares(residuals, np.zeros(4 + PROFILE), loss="cauchy", f_scale=BODY_SCALE, max_nfev=30)
+    surface = moved(answer.x)
+    return surface, _off(cloud, surface, size)
+
+
+def _off(points: torch.Tensor, surface: Revolution, size: float) -> float:
+    return float(body_loss(distances_from_revolution(surface, points) / size))
+
+
+def _coaxial(
+    points: Float[np.ndarray, "n 3"], center: Float[np.ndarray, "3"], axes: Float[np.ndarray, "3 3"], size: float
+) -> Revolution:
+    """The surface of revolution about the last of an ellipsoid's axes: reweighted least squares."""
+    from scipy.interpolate import BSpline
+
+    radii = np.linalg.norm(axes, axis=0)
+    frame = axes / radii * np.sign(np.linalg.det(axes))
+    local = (points - center) @ frame
+    ends = np.quantile(local[:, 2], (0.002, 0.998))
+    knots = ends[0] + (ends[1] - ends[0]) / (PROFILE - 3) * (np.arange(PROFILE + 4) - 3)
+    matrix = BSpline(knots, np.eye(PROFILE), 3)(np.clip(local[:, 2], *ends))
+    squared = (local[:, :2] ** 2).sum(1) / size**2
+    stiff = _STIFFNESS * len(points) ** 0.5 * np.diff(np.eye(PROFILE), 3, axis=0)
+    weights, answer = np.ones(len(points)), np.zeros(PROFILE)
+    for _ in range(15):
+        rows = np.concatenate([weights[:, None] * matrix, stiff])
+        answer = np.linalg.lstsq(rows, np.concatenate([weights * squared, np.zeros(len(stiff))]), rcond=None)[0]
+        weights = 1 / np.sqrt(1 + ((matrix @ answer - squared) / (2 * BODY_SCALE)) ** 2)
+    arrays = (np.array(center, float), frame, radii, ends, size**2 * answer)
+    return Revolution(*(torch.from_numpy(np.ascontiguousarray(a)) for a in arrays))
 
 
 def surroundings(

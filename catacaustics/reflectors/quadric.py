@@ -9,34 +9,28 @@ image of paraxial optics, upright or inverted. An ellipsoid follows from the sph
 """
 
 import math
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
-from catacaustics.shapes import Bool, Float
+from catacaustics.reflectors.fermat import (
+    Path,
+    Specular,
+    convex,
+    display_jacobian,
+    path_over,
+    reflects,
+    shortened,
+    solve2,
+    tangents,
+)
+from catacaustics.shapes import Float
 
 _ITERATIONS = 40
 _SCAN = 65
 """Angles at which a concave mirror's roots are looked for, where several can be."""
 _MAX_STEP = 0.4
 """Newton steps on the ellipsoid are cut to this many radians."""
-_GRAZING = 1e-3
-"""Cosine of incidence below which a point counts as invisible: the rim, where the image shrinks to nothing."""
-_STRETCH = 30.0
-"""Magnification is cut to this: a concave mirror with the source at the focus would show it infinitely large."""
-
-
-class Specular(NamedTuple):
-    """Points of reflection: differentiable `points`; `visible` where camera and source face the mirror there and the
-    path is stationary; `jacobian` (no gradients), the map from displacements of the source to displacements of the
-    displayed point, which lies on the ray at the length of the path; `start`, the solution on the unit sphere, which
-    saves solving again for the same arguments: then `visible` and `jacobian` are None, as they are known."""
-
-    points: Float[Tensor, "n 3"]
-    visible: Bool[Tensor, "n"] | None
-    jacobian: Float[Tensor, "n 3 3"] | None
-    start: Float[Tensor, "n 3"]
 
 
 def sphere_angle(
@@ -125,49 +119,29 @@ def specular_points(
         start: what an earlier call returned for the same arguments.
     """
     with torch.no_grad():
-        u = _solve(sources, camera, center, axes, concave) if start is None else start
-        basis = _tangents(u)
-        path = _path(u, sources, camera, center, axes)
+        u = stationary(sources, camera, center, axes, concave) if start is None else start
+        basis = tangents(u)
+        path = path_over(center + u @ axes.T, sources, camera)
         hessian = _hessian(path, u, basis, axes)
-    gradient = _gradient(_path(u, sources, camera, center, axes), axes)
-    step = _solve2(hessian, torch.einsum("nij,ni->nj", basis, gradient))
-    moved = u - torch.einsum("nij,nj->ni", basis, _shortened(step, _MAX_STEP))
+    gradient = _gradient(path_over(center + u @ axes.T, sources, camera), axes)
+    step = solve2(hessian, torch.einsum("nij,ni->nj", basis, gradient))
+    moved = u - torch.einsum("nij,nj->ni", basis, shortened(step, _MAX_STEP))
     points = center + torch.nn.functional.normalize(moved, dim=1) @ axes.T
     if start is not None:
         return Specular(points, None, None, u)
     with torch.no_grad():
         normal = torch.nn.functional.normalize(u @ torch.linalg.inv(axes), dim=1) * (-1 if concave else 1)
-        cosine = torch.minimum((normal * path.to_camera).sum(1), (normal * path.to_source).sum(1))
-        tangential = path.to_camera + path.to_source
-        tangential = tangential - (tangential * normal).sum(1, keepdim=True) * normal
-        visible = (cosine > _GRAZING) & (tangential.norm(dim=1) < 1e-2)
-        jacobian = _display_jacobian(path, hessian, basis, axes)
+        visible = reflects(path, normal)
+        jacobian = display_jacobian(path, hessian, torch.einsum("ij,njk->nik", axes, basis))
     return Specular(points, visible, jacobian, u)
 
 
-class _Path(NamedTuple):
-    """Unit vectors from the mirror to camera and source, and the distances."""
-
-    to_camera: Tensor
-    to_source: Tensor
-    camera_distance: Tensor
-    source_distance: Tensor
-
-
-def _path(u: Tensor, sources: Tensor, camera: Tensor, center: Tensor, axes: Tensor) -> _Path:
-    points = center + u @ axes.T
-    a, b = camera - points, sources - points
-    tiny = torch.finfo(u.dtype).tiny ** 0.5
-    da, db = (torch.sqrt((v * v).sum(1, keepdim=True) + tiny) for v in (a, b))
-    return _Path(a / da, b / db, da, db)
-
-
-def _gradient(path: _Path, axes: Tensor) -> Tensor:
+def _gradient(path: Path, axes: Tensor) -> Tensor:
     """dL/du."""
     return -(path.to_camera + path.to_source) @ axes
 
 
-def _hessian(path: _Path, u: Tensor, basis: Tensor, axes: Tensor) -> Tensor:
+def _hessian(path: Path, u: Tensor, basis: Tensor, axes: Tensor) -> Tensor:
     """Second derivatives of L along the tangents of the unit sphere, (n, 2, 2), kept away from singular."""
     edges = torch.einsum("ij,njk->nik", axes, basis)
     total = edges.new_zeros(len(u), 2, 2)
@@ -179,34 +153,23 @@ def _hessian(path: _Path, u: Tensor, basis: Tensor, axes: Tensor) -> Tensor:
     return total
 
 
-def _solve2(matrix: Tensor, vector: Tensor) -> Tensor:
-    """Solve symmetric 2x2 systems; a singular one gives a large finite answer."""
-    a, b, d = matrix[:, 0, 0], matrix[:, 0, 1], matrix[:, 1, 1]
-    x, y = vector.unbind(1)
-    return torch.stack([d * x - b * y, a * y - b * x], 1) / _determinant(matrix)[:, None]
+def distances(
+    points: Float[Tensor, "n 3"], center: Float[Tensor, "3"], axes: Float[Tensor, "3 3"]
+) -> Float[Tensor, "n"]:
+    """Signed distances from an ellipsoid, outside positive, to first order (Taubin 1991); differentiable."""
+    inverse = torch.linalg.inv(axes)
+    scaled = (points - center) @ inverse.T
+    norms = scaled.norm(dim=1).clamp_min(1e-9)
+    return (norms - 1) * norms / (scaled @ inverse).norm(dim=1).clamp_min(1e-9)
 
 
-def _determinant(matrix: Tensor) -> Tensor:
-    determinant = matrix[:, 0, 0] * matrix[:, 1, 1] - matrix[:, 0, 1] ** 2
-    floor = 1e-6 * matrix.square().sum((1, 2)) + torch.finfo(matrix.dtype).tiny ** 0.5
-    return torch.where(determinant.abs() < floor, torch.where(determinant < 0, -floor, floor), determinant)
-
-
-def _shortened(step: Tensor, limit: float) -> Tensor:
-    return step / (step.norm(dim=1, keepdim=True) / limit).clamp_min(1)
-
-
-def _tangents(u: Tensor) -> Tensor:
-    """Two orthonormal tangents of the unit sphere, (n, 3, 2) (Duff et al. 2017)."""
-    x, y, z = u.unbind(1)
-    sign = torch.where(z < 0, -torch.ones_like(z), torch.ones_like(z))
-    a = -1 / (sign + z)
-    b = x * y * a
-    first = torch.stack([1 + sign * x * x * a, sign * b, -sign * x], 1)
-    return torch.stack([first, torch.stack([b, sign + y * y * a, -y], 1)], 2)
-
-
-def _solve(sources: Tensor, camera: Tensor, center: Tensor, axes: Tensor, concave: bool) -> Tensor:
+def stationary(
+    sources: Float[Tensor, "n 3"],
+    camera: Float[Tensor, "3"],
+    center: Float[Tensor, "3"],
+    axes: Float[Tensor, "3 3"],
+    concave: bool,
+) -> Float[Tensor, "n 3"]:
     """Unit vectors u of the stationary points: exact for a sphere, from there by Newton's method."""
     radii = axes.norm(dim=0)
     v, w = (camera - center).expand_as(sources), sources - center
@@ -216,7 +179,7 @@ def _solve(sources: Tensor, camera: Tensor, center: Tensor, axes: Tensor, concav
     # Across v, in the plane of v and w; any perpendicular where they are in line.
     across = unit_w - (unit_w * unit_v).sum(1, keepdim=True) * unit_v
     between = torch.atan2(across.norm(dim=1), (unit_w * unit_v).sum(1))
-    sideways = torch.where(across.norm(dim=1, keepdim=True) > 1e-6, across, _tangents(unit_v)[:, :, 0])
+    sideways = torch.where(across.norm(dim=1, keepdim=True) > 1e-6, across, tangents(unit_v)[:, :, 0])
     sideways = torch.nn.functional.normalize(sideways, dim=1)
     sign = -1.0 if concave else 1.0
     angle = sphere_angle(dv, dw, between, sign * radii.mean())[:, None]
@@ -229,63 +192,14 @@ def _solve(sources: Tensor, camera: Tensor, center: Tensor, axes: Tensor, concav
     active = torch.arange(len(u), device=u.device)
     for _ in range(_ITERATIONS // 2):
         here = u[active]
-        path, basis = _path(here, sources[active], camera, center, axes), _tangents(here)
+        path, basis = path_over(center + here @ axes.T, sources[active], camera), tangents(here)
         gradient = torch.einsum("nij,ni->nj", basis, _gradient(path, axes))
         hessian = _hessian(path, here, basis, axes)
         if not concave:
-            # L has a minimum: where it is not convex yet, add to the diagonal until it is.
-            middle = (hessian[:, 0, 0] + hessian[:, 1, 1]) / 2
-            spread = ((hessian[:, 0, 0] - hessian[:, 1, 1]) ** 2 / 4 + hessian[:, 0, 1] ** 2).sqrt()
-            lift = (1e-3 * (middle.abs() + spread) - (middle - spread)).clamp_min(0)
-            hessian.diagonal(dim1=1, dim2=2).add_(lift[:, None])
-        step = _shortened(_solve2(hessian, gradient), _MAX_STEP)
+            hessian = convex(hessian)  # L has a minimum
+        step = shortened(solve2(hessian, gradient), _MAX_STEP)
         u[active] = torch.nn.functional.normalize(here - torch.einsum("nij,nj->ni", basis, step), dim=1)
         active = active[step.abs().amax(1) >= tolerance]
         if not len(active):
             break
     return u
-
-
-def _display_jacobian(path: _Path, hessian: Tensor, basis: Tensor, axes: Tensor) -> Tensor:
-    """d(displayed) / d(source) across the ray: D / (d1 d2) (I - a a') E H^-1 E' (I - b b'), E the mirror's tangents.
-
-    For a sphere this is Coddington's pair of magnifications, 1 / (1 + 2 d1 d2 cos(i) / (r D)) across the plane of
-    incidence and 1 / (1 + 2 d1 d2 / (r cos(i) D)) in it, D = d1 + d2.
-    """
-    edges = torch.einsum("ij,njk->nik", axes, basis)
-    columns = []
-    for direction, distance in (path[::2], path[1::2]):
-        across = edges - direction[:, :, None] * torch.einsum("ni,nij->nj", direction, edges)[:, None, :]
-        columns.append(across / distance[:, :, None])
-    a, b, d = hessian[:, 0, 0], hessian[:, 0, 1], hessian[:, 1, 1]
-    inverse = torch.stack([d, -b, -b, a], 1).view(-1, 2, 2) / _determinant(hessian)[:, None, None]
-    length = (path.camera_distance + path.source_distance)[:, :, None]
-    return length * columns[0] @ inverse @ columns[1].transpose(1, 2)
-
-
-def tilted_disks(
-    jacobian: Float[Tensor, "n 3 3"], to_camera: Float[Tensor, "n 3"]
-) -> tuple[Float[Tensor, "n 3"], Float[Tensor, "n"]]:
-    """Normals and factors of the squared radius of disks that look like the images of round sources under a Jacobian.
-
-    A disk whose normal is tilted by t against the ray looks like an ellipse of axes 1 and cos t, so that every ellipse
-    can be shown by a disk.
-
-    Args:
-        jacobian: across the rays (its columns are perpendicular to `to_camera`).
-        to_camera: unit vectors.
-    """
-    basis = _tangents(to_camera)
-    flat = basis.transpose(1, 2) @ jacobian
-    covariance = flat @ flat.transpose(1, 2)
-    a, b, d = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
-    middle, half = (a + d) / 2, (a - d) / 2
-    spread = (half * half + b * b).sqrt()
-    major, minor = (middle + spread), (middle - spread).clamp_min(0)
-    aspect = (minor / major.clamp_min(torch.finfo(a.dtype).tiny)).clamp(0, 1)
-    # The major axis is at half the angle of (half, b); the minor one across it.
-    turn = torch.atan2(b, half) / 2
-    axis = torch.stack([-torch.sin(turn), torch.cos(turn)], 1)
-    sideways = torch.einsum("nij,nj->ni", basis, axis)
-    normals = aspect.sqrt()[:, None] * to_camera + (1 - aspect).sqrt()[:, None] * sideways
-    return normals, major.clamp(1e-8, _STRETCH**2)

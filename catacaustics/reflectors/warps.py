@@ -11,7 +11,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from catacaustics.reflectors.quadric import specular_points, tilted_disks
+from catacaustics.reflectors import quadric, revolution
+from catacaustics.reflectors.fermat import Specular, tilted_disks
+from catacaustics.reflectors.revolution import Revolution
 from catacaustics.shapes import Bool, Float
 
 Points = Float[Tensor, "n 3"]
@@ -131,17 +133,54 @@ class QuadricWarp(nn.Module):
         return center, axes
 
     def forward(self, points: Points, center: Float[Tensor, "3"], start: Points | None = None) -> Displayed:
-        middle, axes = self.shape()
-        found = specular_points(points, center, middle, axes, bool(self.concave), start)
-        ray = found.points - center
-        near = ray.norm(dim=1, keepdim=True).clamp_min(1e-12)
-        direction = ray / near
-        length = near + (points - found.points).norm(dim=1, keepdim=True)
-        shown = Displayed(center + length * direction, start=found.start, near=near.detach()[:, 0])
-        if found.jacobian is None:
-            return shown
-        normals, stretch = tilted_disks(found.jacobian, -direction.detach())
-        return shown._replace(normals=normals, stretch=stretch, visible=found.visible)
+        found = quadric.specular_points(points, center, *self.shape(), bool(self.concave), start)
+        return _displayed(found, points, center)
+
+
+def _displayed(found: Specular, points: Points, center: Float[Tensor, "3"]) -> Displayed:
+    """Points on their rays at the length of the path, so that nearer mirrored points hide farther ones."""
+    ray = found.points - center
+    near = ray.norm(dim=1, keepdim=True).clamp_min(1e-12)
+    direction = ray / near
+    length = near + (points - found.points).norm(dim=1, keepdim=True)
+    shown = Displayed(center + length * direction, start=found.start, near=near.detach()[:, 0])
+    if found.jacobian is None:
+        return shown
+    normals, stretch = tilted_disks(found.jacobian, -direction.detach())
+    return shown._replace(normals=normals, stretch=stretch, visible=found.visible)
+
+
+class RevolutionWarp(nn.Module):
+    """The image of a world point in a learned surface of revolution (reflectors/revolution.py), as of QuadricWarp.
+
+    Args:
+        surface: at the start. Its ends stay.
+    """
+
+    start_center: Tensor
+    start_frame: Tensor
+    start_squared: Tensor
+    radii: Tensor
+    ends: Tensor
+
+    def __init__(self, surface: Revolution):
+        super().__init__()
+        for name, value in zip(("start_center", "start_frame", "radii", "ends", "start_squared"), surface, strict=True):
+            self.register_buffer(name, value)
+        self.shift = nn.Parameter(torch.zeros(3))
+        self.turn = nn.Parameter(torch.zeros(3))
+        self.bulge = nn.Parameter(torch.zeros(len(surface.squared)))
+
+    def surface(self) -> Revolution:
+        """The learned surface."""
+        size = self.radii.mean()
+        # One rate fits all: a single coefficient tilts the mirror as fast as a radius of a quadric does.
+        squared = self.start_squared + self.bulge * size**2 / len(self.bulge)
+        frame = rotation_matrix(self.turn) @ self.start_frame
+        return Revolution(self.start_center + self.shift * size, frame, self.radii, self.ends, squared)
+
+    def forward(self, points: Points, center: Float[Tensor, "3"], start: Points | None = None) -> Displayed:
+        return _displayed(revolution.specular_points(points, center, self.surface(), start), points, center)
 
 
 class NeuralWarp(nn.Module):
@@ -182,6 +221,10 @@ class QuadricNeuralWarp(nn.Module):
     def forward(self, points: Points, center: Float[Tensor, "3"], start: Points | None = None) -> Displayed:
         image = self.quadric(points, center, start)
         return image._replace(positions=self.neural(image.positions, center).positions)
+
+
+Mirror = PlaneWarp | QuadricWarp | RevolutionWarp
+"""Rungs that are a mirror and world points."""
 
 
 class MovedWarp(nn.Module):
@@ -254,7 +297,7 @@ def inner_warp(warp: nn.Module) -> nn.Module:
 
 def moved_mirror(
     warp: nn.Module, scale: float, rotation: Float[Tensor, "3 3"], shift: Float[Tensor, "3"]
-) -> PlaneWarp | QuadricWarp | None:
+) -> Mirror | None:
     """The mirror at x_new = scale * rotation x + shift, in surroundings that stay where they are: physically right.
     None for rungs that do not consist of a mirror and world points."""
     with torch.no_grad():
@@ -265,12 +308,16 @@ def moved_mirror(
             center, axes = warp.shape()
             moved = scale * rotation @ center + shift, scale * rotation @ axes
             return QuadricWarp(*moved, len(warp.log_radii) == 1, bool(warp.concave))
+        if isinstance(warp, RevolutionWarp):
+            center, frame, radii, ends, squared = warp.surface()
+            center, frame = scale * rotation @ center + shift, rotation @ frame
+            return RevolutionWarp(Revolution(center, frame, scale * radii, scale * ends, scale**2 * squared))
     return None
 
 
-def mirror_of(warp: nn.Module) -> PlaneWarp | QuadricWarp | None:
+def mirror_of(warp: nn.Module) -> Mirror | None:
     """The mirror of a rung at its place in the world, with what edits have done to it; None where there is none."""
-    if isinstance(warp, PlaneWarp | QuadricWarp):
+    if isinstance(warp, Mirror):
         return warp
     if isinstance(warp, QuadricNeuralWarp):
         return warp.quadric
@@ -304,6 +351,10 @@ def warp_from_state(state: dict[str, Tensor]) -> nn.Module:
     if "start_axes" in state:
         sphere = len(state["log_radii"]) == 1
         warp: nn.Module = QuadricWarp(state["start_center"], state["start_axes"], sphere, bool(state["concave"]))
+    elif "start_squared" in state:
+        warp = RevolutionWarp(
+            Revolution(*(state[k] for k in ("start_center", "start_frame", "radii", "ends", "start_squared")))
+        )
     elif "start_point" in state:
         warp = PlaneWarp(state["start_point"], state["start_normal"], float(state["scale"]))
     elif "network.0.weight" in state:

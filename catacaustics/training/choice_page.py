@@ -45,7 +45,7 @@ def choice_html(folder: Path, result: dict[str, Any], least_gain: float) -> str:
         "choice among models was close, the finalists were trained further and the rule was asked again among them."
     )
     if result["untried"]:
-        rule += f" Not tried, because the training is too short for a network: {', '.join(result['untried'])}."
+        rule += f" Not tried: {'; '.join(f'{rung} ({why})' for rung, why in result['untried'].items())}."
     sections = []
     for question, (title, measure) in _TITLES.items():
         rows = [t for t in trials if t["question"] == question]

@@ -11,7 +11,8 @@ from catacaustics.capture.dataset import Capture
 from catacaustics.config import SplatConfig, TrainConfig
 from catacaustics.environment import EnvironmentMap
 from catacaustics.errors import UserError
-from catacaustics.reflectors.fit import fit_bowl, fit_ellipsoid, fit_plane, fit_sphere, surroundings
+from catacaustics.reflectors.fit import fit_bowl, fit_ellipsoid, fit_plane, fit_revolution, fit_sphere, surroundings
+from catacaustics.reflectors.revolution import Revolution
 from catacaustics.reflectors.visual_hull import sample_visual_hull
 from catacaustics.reflectors.volume import ReflectionVolume, volume_masks
 from catacaustics.reflectors.warps import (
@@ -19,6 +20,7 @@ from catacaustics.reflectors.warps import (
     PlaneWarp,
     QuadricNeuralWarp,
     QuadricWarp,
+    RevolutionWarp,
     StaticWarp,
     learns_positions,
 )
@@ -241,6 +243,10 @@ def _start_warp(reflector: Reflector, centers: Float[np.ndarray, "m 3"], config:
         return QuadricWarp(*tensors(center, radius * np.eye(3)), sphere=True)
     if model == "ellipsoid":
         return QuadricWarp(*tensors(*fit_ellipsoid(volume)), sphere=False)
+    if model == "revolution":
+        points = volume.sample_surface(2000, np.random.default_rng(0))[0]
+        surface, _ = fit_revolution(points, *fit_ellipsoid(volume))
+        return RevolutionWarp(Revolution(*(value.float() for value in surface)))
     if model == "concave":
         center, radius = fit_bowl(volume, centers)
         return QuadricWarp(*tensors(center, radius * np.eye(3)), sphere=False, concave=True)

@@ -5,7 +5,7 @@ only if its mean gain in PSNR inside the reflector exceeds both 0.2 dB and twice
 view: what the noise of a few views could explain is not a reason. The environment map, stereo's guesses and larger
 clouds must earn their place by the same rule, judged on the whole image and inside the reflectors. All trials get the
 same steps; where the choice among rungs is close, the best of them go on for twice as many, and again, and the rule is
-asked among them.
+asked among them. Surfaces of revolution are tried where the visual hull of the masks is one and no ellipsoid.
 """
 
 import shutil
@@ -27,9 +27,10 @@ from catacaustics.training.choice_page import choice_html
 from catacaustics.training.corrections import align_view
 from catacaustics.training.initialize import Reflector, named_reflectors, scene_extent, usual_points
 from catacaustics.training.loop import fit
+from catacaustics.training.mirrors import is_turned
 from catacaustics.training.photographs import photograph, scaled_camera
 
-LADDER = ("none", "static", "plane", "sphere", "ellipsoid", "concave", "neural", "quadric+neural")
+LADDER = ("none", "static", "plane", "sphere", "ellipsoid", "revolution", "concave", "neural", "quadric+neural")
 """Rungs from the simplest to the most complex."""
 
 _NETWORKS = ("neural", "quadric+neural")
@@ -123,9 +124,14 @@ def choose_models(capture: Capture, volumes: list[ReflectionVolume], config: Tra
         return config
     trials = _Trials(capture, volumes, config)
     hurried = _hurried(config)  # no networks, usual sizes, an environment map, photographs as they are
-    ladder = [rung for rung in LADDER if not (hurried and rung in _NETWORKS)]
+    untried = {}
     if hurried:
-        print(f"model selection: less than {_PATIENT} minutes, so {' and '.join(_NETWORKS)} are not tried")
+        untried |= dict.fromkeys(_NETWORKS, f"takes more than {_PATIENT} minutes")
+    if not any(is_turned(r.volume, capture) for r in reflectors if r.model == "auto"):
+        untried["revolution"] = "the masks show an ellipsoid, or no turned shape"
+    for rung, why in untried.items():
+        print(f"model selection: {rung} is not tried: {why}")
+    ladder = [rung for rung in LADDER if rung not in untried]
     models = _models(trials, reflectors, ladder)
     chosen: dict = {"model": tuple(models)}
     taken = {"model": models}
@@ -150,7 +156,7 @@ def choose_models(capture: Capture, volumes: list[ReflectionVolume], config: Tra
         taken[question] = [done[index].name]
         chosen[field] = int(_FACTORS[index] * usual_points(capture, volumes, config)[field])
     chosen |= {} if hurried else _photographs(trials, config, chosen, taken)
-    trials.finish(chosen, taken, [v.name for v in volumes], [rung for rung in LADDER if rung not in ladder])
+    trials.finish(chosen, taken, [v.name for v in volumes], untried)
     minutes = None if config.minutes is None else max(config.minutes - trials.seconds / 60, 0.25 * config.minutes)
     return replace(config, minutes=minutes, **chosen)
 
@@ -263,7 +269,7 @@ class _Trials:
         write_json(self.run_folder / "model_choice.json", {"key": self._key, "trials": [asdict(t) for t in self.done]})
         return trial
 
-    def finish(self, chosen: dict, taken: dict[str, list[str]], reflectors: list[str], untried: list[str]) -> None:
+    def finish(self, chosen: dict, taken: dict[str, list[str]], reflectors: list[str], untried: dict[str, str]) -> None:
         result = {
             "key": self._key,
             "chosen": _plain(chosen),

@@ -1,0 +1,209 @@
+"""Where a mirror of revolution shows a point: Fermat's principle on x^2 + y^2 = q(z), q a cubic B-spline.
+
+The squared radius q is smooth where the mirror meets its axis, and of an ellipsoid of revolution it is quadratic in z:
+vases, bottles and lamps are as easy as balls. Where the mirror is bent inwards, as at a neck, a source can be seen at
+several points; the one that is kept is found downhill, along shorter paths, from where an ellipsoid about as large
+would show it.
+"""
+
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from catacaustics.reflectors.fermat import (
+    Path,
+    Specular,
+    convex,
+    display_jacobian,
+    path_over,
+    reflects,
+    shortened,
+    solve2,
+    tangents,
+)
+from catacaustics.reflectors.quadric import stationary
+from catacaustics.shapes import Float
+
+_ITERATIONS = 30
+_MAX_STEP = 0.4
+"""Newton steps are cut to this, in units of the mean radius."""
+_OFF = 1e-3
+"""A point farther from the mirror than this, in units of the mean radius, has not been found."""
+
+_MARCH, _BISECTIONS = 129, 40
+"""Steps in which rays look for the mirror, and then narrow down where they meet it."""
+
+
+class Revolution(NamedTuple):
+    """A surface of revolution, and an ellipsoid about as large.
+
+    Args:
+        center: (3,) on the axis, where z = 0.
+        frame: (3, 3) rotation, the axis in its third column.
+        radii: (3,) of the ellipsoid in that frame.
+        ends: (2,) values of z between which the mirror is; beyond them q goes on in a straight line.
+        squared: (k,) coefficients of q, k >= 4.
+    """
+
+    center: Float[Tensor, "3"]
+    frame: Float[Tensor, "3 3"]
+    radii: Float[Tensor, "3"]
+    ends: Float[Tensor, "2"]
+    squared: Float[Tensor, "k"]
+
+
+def profile(
+    surface: Revolution, z: Float[Tensor, "n"]
+) -> tuple[Float[Tensor, "n"], Float[Tensor, "n"], Float[Tensor, "n"]]:
+    """The squared radius q at heights along the axis, and its first two derivatives; differentiable."""
+    low, high = surface.ends
+    cell = (high - low) / (len(surface.squared) - 3)
+    place = (z - low) / cell
+    first = place.detach().nan_to_num().floor().clamp(0, len(surface.squared) - 4)
+    t = (place - first).clamp(0, 1)
+    beyond = place - first - t
+    a, b, c, d = (surface.squared[first.long() + i] for i in range(4))
+    value = ((1 - t) ** 3 * a + (3 * t**3 - 6 * t**2 + 4) * b + (3 * (t + t**2 - t**3) + 1) * c + t**3 * d) / 6
+    slope = (-((1 - t) ** 2) * a + (3 * t**2 - 4 * t) * b + (1 + 2 * t - 3 * t**2) * c + t**2 * d) / 2
+    curvature = torch.where(beyond == 0, (1 - t) * a + (3 * t - 2) * b + (1 - 3 * t) * c + t * d, 0)
+    return value + slope * beyond, slope / cell, curvature / cell**2
+
+
+class _Level(NamedTuple):
+    """F = x^2 + y^2 - q(z), its gradient and second derivatives in world coordinates."""
+
+    value: Float[Tensor, "n"]
+    gradient: Float[Tensor, "n 3"]
+    second: Float[Tensor, "n 3 3"]
+
+
+def _level(surface: Revolution, points: Float[Tensor, "n 3"]) -> _Level:
+    local = (points - surface.center) @ surface.frame
+    q, slope, curvature = profile(surface, local[:, 2])
+    across = local[:, :2]
+    gradient = torch.cat([2 * across, -slope[:, None]], 1) @ surface.frame.T
+    axis = surface.frame[:, 2]
+    flat = 2 * torch.eye(3, dtype=points.dtype, device=points.device)
+    second = flat - (2 + curvature)[:, None, None] * axis[:, None] * axis
+    return _Level((across * across).sum(1) - q, gradient, second)
+
+
+def distances(surface: Revolution, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+    """Signed distances from the surface, outside positive, to first order (Taubin 1991); differentiable."""
+    level = _level(surface, points)
+    return level.value / level.gradient.norm(dim=1).clamp_min(1e-9 * float(surface.radii.detach().mean()))
+
+
+def ray_distances(surface: Revolution, origin: Float[Tensor, "3"], rays: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
+    """Distances along unit rays to where they first meet the surface, nan where they miss it; they pass nothing that is
+    thinner than 1 % of its length."""
+    middle = surface.center + surface.ends.mean() * surface.frame[:, 2]
+    reach = ((surface.ends[1] - surface.ends[0]).square() / 4 + surface.squared.max().clamp_min(0)).sqrt()
+    nearest = rays @ (middle - origin)
+    first = (nearest - reach).clamp_min(0)
+
+    def inside(points: Tensor) -> Tensor:
+        local = (points - surface.center) @ surface.frame
+        between = (local[:, 2] > surface.ends[0]) & (local[:, 2] < surface.ends[1])
+        return between & (local[:, :2].square().sum(1) < profile(surface, local[:, 2])[0])
+
+    low, high = first, torch.full_like(first, torch.nan)
+    for share in torch.linspace(0, 1, _MARCH)[1:].tolist():
+        here = first + share * (nearest + reach - first)
+        met = high.isnan() & inside(origin + here[:, None] * rays)
+        high = torch.where(met, here, high)
+        low = torch.where(high.isnan(), here, low)
+    for _ in range(_BISECTIONS):
+        here = (low + high) / 2
+        met = inside(origin + here[:, None] * rays)
+        low, high = torch.where(met, low, here), torch.where(met, here, high)
+    z = (origin + high[:, None] * rays - surface.center) @ surface.frame[:, 2]
+    margin = 1e-6 * (surface.ends[1] - surface.ends[0])
+    on_mirror = (z > surface.ends[0] + margin) & (z < surface.ends[1] - margin)  # and not on a flat end
+    return torch.where(on_mirror & (high > 0), high, torch.nan)
+
+
+def specular_points(
+    sources: Float[Tensor, "n 3"],
+    camera: Float[Tensor, "3"],
+    surface: Revolution,
+    start: Float[Tensor, "n 3"] | None = None,
+) -> Specular:
+    """Points of reflection on the outside of a surface of revolution, with exact first derivatives by all arguments.
+
+    As `quadric.specular_points`: the solution x is found without gradients; one more Newton step of grad L = m grad F,
+    F = 0, differentiated with its matrix held fixed, is the implicit function theorem.
+
+    Args:
+        sources: world positions of what is mirrored.
+        camera: camera centre.
+        start: what an earlier call returned for the same arguments.
+    """
+    size = float(surface.radii.detach().mean())
+    with torch.no_grad():
+        at = _solve(sources, camera, surface, size) if start is None else start
+        path, level = path_over(at, sources, camera), _level(surface, at)
+        steepness = level.gradient.norm(dim=1, keepdim=True).clamp_min(1e-9 * size)
+        normal = level.gradient / steepness
+        basis = tangents(normal)
+        whole, multiplier = _lagrangian(path, level, steepness)
+        hessian = basis.transpose(1, 2) @ whole @ basis
+    here, towards = _level(surface, at), path_over(at, sources, camera)
+    off = (-here.value[:, None] / steepness).clamp(-_MAX_STEP * size, _MAX_STEP * size)
+    rest = -(towards.to_camera + towards.to_source) - multiplier * here.gradient
+    rest = rest + torch.einsum("nij,nj->ni", whole, normal) * off
+    step = shortened(solve2(hessian, torch.einsum("nij,ni->nj", basis, rest)), _MAX_STEP * size)
+    points = at - torch.einsum("nij,nj->ni", basis, step) + normal * off
+    if start is not None:
+        return Specular(points, None, None, at)
+    with torch.no_grad():
+        z = (at - surface.center) @ surface.frame[:, 2]
+        visible = reflects(path, normal) & (z > surface.ends[0]) & (z < surface.ends[1])
+        visible &= level.value.abs() < _OFF * size * steepness[:, 0]
+        jacobian = display_jacobian(path, hessian, basis)
+    return Specular(points, visible, jacobian, at)
+
+
+def _lagrangian(path: Path, level: _Level, steepness: Tensor) -> tuple[Tensor, Tensor]:
+    """Second derivatives by x of L - m F, (n, 3, 3), and the multiplier m (n, 1)."""
+    gradient = -(path.to_camera + path.to_source)
+    multiplier = (gradient * level.gradient).sum(1, keepdim=True) / steepness**2
+    total = -multiplier[:, :, None] * level.second
+    one = torch.eye(3, dtype=gradient.dtype, device=gradient.device)
+    for direction, distance in (path[::2], path[1::2]):
+        total = total + (one - direction[:, :, None] * direction[:, None, :]) / distance[:, :, None]
+    return total, multiplier
+
+
+def _solve(sources: Tensor, camera: Tensor, surface: Revolution, size: float) -> Tensor:
+    """Stationary points on the surface, by Newton's method along it from those on the ellipsoid."""
+    axes = surface.frame * surface.radii
+    x = surface.center + stationary(sources, camera, surface.center, axes, False) @ axes.T
+    x = _onto(surface, x, size, 3)
+    # Newton's method doubles the digits: the last, differentiated step reaches the rest.
+    tolerance = size * torch.finfo(x.dtype).eps ** 0.6
+    active = torch.arange(len(x), device=x.device)
+    for _ in range(_ITERATIONS):
+        here = x[active]
+        path, level = path_over(here, sources[active], camera), _level(surface, here)
+        steepness = level.gradient.norm(dim=1, keepdim=True).clamp_min(1e-9 * size)
+        basis = tangents(level.gradient / steepness)
+        hessian = basis.transpose(1, 2) @ _lagrangian(path, level, steepness)[0] @ basis
+        downhill = torch.einsum("nij,ni->nj", basis, path.to_camera + path.to_source)
+        step = shortened(solve2(convex(hessian), downhill), _MAX_STEP * size)
+        moved = _onto(surface, here + torch.einsum("nij,nj->ni", basis, step), size, 1)
+        x[active] = moved
+        active = active[(moved - here).abs().amax(1) >= tolerance]
+        if not len(active):
+            break
+    return x
+
+
+def _onto(surface: Revolution, points: Tensor, size: float, steps: int) -> Tensor:
+    """Towards the surface along its normals, by steps of Newton's method."""
+    for _ in range(steps):
+        level = _level(surface, points)
+        squared = level.gradient.square().sum(1, keepdim=True).clamp_min((1e-3 * size) ** 2)
+        points = points - shortened(level.value[:, None] / squared * level.gradient, _MAX_STEP * size)
+    return points
