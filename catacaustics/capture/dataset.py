@@ -80,8 +80,11 @@ class Capture:
 
     def guesses(self) -> PointCloud | None:
         """Points for the holes of the fused cloud, many of them wrong; None where the capture has none."""
-        path = self.root / "guesses.ply"
-        return read_ply(path) if path.is_file() else None
+        return read_ply(self.root / "guesses.ply") if self.has_guesses else None
+
+    @property
+    def has_guesses(self) -> bool:
+        return (self.root / "guesses.ply").is_file()
 
     def _check_size(self, image: np.ndarray, view: View, path: Path) -> None:
         height, width = image.shape[:2]

@@ -84,10 +84,11 @@ def _sampled(image: Float[np.ndarray, "height width"], pixels: Float[np.ndarray,
     height, width = image.shape
     outside = (pixels < 0).any(1) | (pixels[:, 0] > width - 1) | (pixels[:, 1] > height - 1)
     rows = -(-len(pixels) // _ROW)
-    maps = np.zeros((rows * _ROW, 2), np.float32)
-    maps[: len(pixels)] = np.where(outside[:, None], 0, pixels)
-    sampled = cv2.remap(image, maps.reshape(rows, _ROW, 2), None, cv2.INTER_LINEAR).ravel()[: len(pixels)]
-    return np.where(outside, np.nan, sampled)
+    maps = np.zeros((2, rows * _ROW), np.float32)
+    maps[:, : len(pixels)] = np.where(outside, 0, pixels.T)
+    x, y = maps.reshape(2, rows, _ROW)
+    sampled = cv2.remap(image, x, y, cv2.INTER_LINEAR)
+    return np.where(outside, np.nan, sampled.ravel()[: len(pixels)])
 
 
 def _crossings(

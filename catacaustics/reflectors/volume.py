@@ -413,15 +413,15 @@ def _most_hidden(masks: list[tuple[str, Camera, np.ndarray]], volume: Reflection
     outside = np.stack([(points @ p[:, :3].T + p[:, 3] > 0).any(1) for p in planes])
     rays = normalize(np.stack([camera.center - volume.center for _, camera, _ in masks]))
     apart = rays @ rays.T < np.cos(np.radians(_APART))
-    shares = np.ones(len(masks))
+    shares, left = np.ones(len(masks)), {}
     for i in np.flatnonzero(apart.sum(1) >= _WITNESSES):
-        rest = ~outside[apart[i]].any(0)
-        whole = _picture_area(points[rest], masks[i][1])
-        shares[i] = _picture_area(points[rest], *masks[i][1:]) / whole if whole else 1.0
+        left[i] = ~outside[apart[i]].any(0)
+        whole = _picture_area(points[left[i]], masks[i][1])
+        shares[i] = _picture_area(points[left[i]], *masks[i][1:]) / whole if whole else 1.0
     for i in np.argsort(shares):
         if shares[i] >= _SHOWN:
             return None
-        rest = ~outside[apart[i]].any(0)
+        rest = left[i]
         kept = points[rest & ~outside[i]]
         witnesses = [masks[j][1:] for j in np.flatnonzero(apart[i])]
         losses = sorted(1 - _picture_area(kept, *w) / max(_picture_area(points[rest], *w), 1.0) for w in witnesses)
@@ -463,28 +463,28 @@ def build_volume(capture: Capture, reflector: str) -> ReflectionVolume:
             f"one of: {', '.join(capture.reflectors) or 'none yet'}",
             f"paint masks: `catacaustics mask {capture.root}`",
         )
-    masks = _painted_masks(capture, reflector)
-    hidden = partly_hidden(masks)
+    masks, hidden = _whole_masks(capture, reflector)
     if hidden:
         print(
             f"volume: {reflector}'s masks in {_listed(hidden)} show less of it than the others agree on (something "
             "stands before it?); left out"
         )
-    return volume_from_masks(reflector, [m for m in masks if m[0] not in hidden])
+    return volume_from_masks(reflector, masks)
 
 
 def volume_masks(capture: Capture, reflector: str) -> list[tuple[str, Camera, Bool[np.ndarray, "height width"]]]:
     """Names, cameras and masks that the volume of one of a capture's reflectors is made of: those of `volume_views`
     that show all of it."""
-    masks = _painted_masks(capture, reflector)
-    hidden = partly_hidden(masks)
-    return [m for m in masks if m[0] not in hidden]
+    return _whole_masks(capture, reflector)[0]
 
 
-def _painted_masks(capture: Capture, reflector: str) -> list[tuple[str, Camera, np.ndarray]]:
+def _whole_masks(capture: Capture, reflector: str) -> tuple[list[tuple[str, Camera, np.ndarray]], list[str]]:
+    """The masks that show all of a reflector, and the names of the others."""
     masked = {v.name for v in capture.views if capture.mask_path(v, reflector).is_file()}
-    masks = [(v.name, v.camera, capture.mask(v, reflector)) for v in volume_views(capture, masked)]
-    return [(name, camera, mask) for name, camera, mask in masks if mask is not None]
+    painted = [(v.name, v.camera, capture.mask(v, reflector)) for v in volume_views(capture, masked)]
+    masks = [(name, camera, mask) for name, camera, mask in painted if mask is not None]
+    hidden = partly_hidden(masks)
+    return [m for m in masks if m[0] not in hidden], hidden
 
 
 def write_volume(capture: Capture, volume: ReflectionVolume) -> None:

@@ -24,14 +24,14 @@ _BODY_WEIGHT = 0.1
 """Of the distance from the visual hull beside the photographs, which say little of a painted mirror's shape."""
 
 _ROUND, _TURNED = 0.3, 0.5
-"""An ellipsoid of a smaller loss (`body_loss`) is the body's shape; otherwise a surface of revolution is where it has
-less than this share of the loss. Loss of the ellipsoid and share: balls and egg 0.01 to 0.2; kettle 0.91, 0.63; vase
-1.15, 0.2."""
+"""A body is an ellipsoid where its loss (`body_loss`) is below the first; otherwise it is turned where a surface of
+revolution has less than the second's share of that. Losses and shares measured: balls and egg up to 0.17; kettle 0.91,
+0.78; vase 1.15, 0.30; bowl 1.42, 0.07; bent sheet 2.66, 0.36."""
 
 
 def start_shapes(scene: Scene, capture: Capture, config: TrainConfig) -> None:
-    """Fit every quadric and plane to the photographs while everything else stands still, quadrics from several sizes
-    and from the body in the visual hull; the best remains.
+    """Fit every mirror to the photographs while everything else stands still, quadrics from several sizes and from the
+    body in the visual hull; the best remains.
 
     A volume from few or careless masks is too large, a convex hull has handles and spouts in it, and a flat one tells
     little of how it is bent; training does not find back from far. The surroundings are known in outline, so that a
@@ -44,11 +44,18 @@ def start_shapes(scene: Scene, capture: Capture, config: TrainConfig) -> None:
         for warp, volume in zip(scene.warps, scene.volumes, strict=True):
             mirror = warp.quadric if isinstance(warp, QuadricNeuralWarp) else warp
             if isinstance(mirror, Mirror):
-                body = _body_points(mirror, volume, capture)
+                bent = _bent(mirror, volume)
+                hollow = isinstance(mirror, QuadricWarp) and bool(mirror.concave)
+                round_body = not (bent or hollow or isinstance(mirror, PlaneWarp))
+                body = (
+                    torch.from_numpy(_hull_points(volume, capture)).to(scene.device, torch.float32)
+                    if round_body
+                    else None
+                )
                 boxes = [_middle_box(volume.scaled(0.6), camera) for _, camera in cameras]
                 seen = [(v, c, box) for (v, c), box in zip(cameras, boxes, strict=True) if box is not None]
                 if seen:
-                    _start_shape(scene, capture, mirror, _starts(mirror, volume, body), seen, body)
+                    _start_shape(scene, capture, mirror, _starts(mirror, volume, body, bent), seen, body)
 
 
 def _start_shape(
@@ -100,13 +107,6 @@ def _start_shape(
             tensor.copy_(value)
 
 
-def _body_points(mirror: Mirror, volume: ReflectionVolume, capture: Capture) -> Float[torch.Tensor, "n 3"] | None:
-    """Points on the visual hull of what may be a round body; none for planes, bowls and sheets."""
-    if isinstance(mirror, PlaneWarp) or (isinstance(mirror, QuadricWarp) and (mirror.concave or _bent(mirror, volume))):
-        return None
-    return torch.from_numpy(_hull_points(volume, capture)).to(mirror.shift)
-
-
 def _hull_points(volume: ReflectionVolume, capture: Capture) -> Float[np.ndarray, "n 3"]:
     return sample_visual_hull(volume, volume_masks(capture, volume.name), 2000, np.random.default_rng(0))[0]
 
@@ -128,26 +128,31 @@ def is_turned(volume: ReflectionVolume, capture: Capture) -> bool:
     return loss > _ROUND and fit_revolution(points, center, axes)[1] < _TURNED * loss
 
 
-def _bent(mirror: QuadricWarp, volume: ReflectionVolume) -> list[tuple[np.ndarray, np.ndarray]]:
-    return [] if len(mirror.log_radii) == 1 else fit_bent_sheet(volume)
+def _bent(mirror: Mirror, volume: ReflectionVolume) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The cylinders of a flat volume, for an ellipsoid."""
+    ellipsoid = isinstance(mirror, QuadricWarp) and len(mirror.log_radii) == 3 and not mirror.concave
+    return fit_bent_sheet(volume) if ellipsoid else []
 
 
-def _starts(mirror: Mirror, volume: ReflectionVolume, body: torch.Tensor | None) -> list[list[torch.Tensor]]:
-    """Buffers of a mirror to start from: as it is; convex ones smaller too and as the body in the visual hull, or bent
-    sheets where the volume is flat."""
+def _starts(
+    mirror: Mirror,
+    volume: ReflectionVolume,
+    body: Float[torch.Tensor, "n 3"] | None,
+    bent: list[tuple[np.ndarray, np.ndarray]],
+) -> list[list[torch.Tensor]]:
+    """Buffers of a mirror to start from: as it is; convex quadrics smaller too and as the body in the visual hull, or
+    as a bent sheet; surfaces of revolution as that body."""
     start = [b.clone() for b in mirror.buffers()]
-    if isinstance(mirror, RevolutionWarp):
-        assert body is not None, "every body has a visual hull"
-        points = body.cpu().numpy().astype(float)
+    points = None if body is None else body.cpu().numpy().astype(float)
+    if isinstance(mirror, RevolutionWarp) and points is not None:
         surface, _ = fit_revolution(points, *fit_body(points, *fit_ellipsoid(volume), sphere=False))
         return [[value.to(start[0]) for value in surface]]
-    if isinstance(mirror, PlaneWarp) or mirror.concave:
+    if not isinstance(mirror, QuadricWarp) or mirror.concave:
         return [start]
     center, axes, concave = start
-    if body is None:
-        found, sizes = _bent(mirror, volume), (1.0,)
-    else:
-        points, *shape = (t.cpu().numpy().astype(float) for t in (body, center, axes))
+    found, sizes = bent, (1.0,)
+    if points is not None:
+        shape = (t.cpu().numpy().astype(float) for t in (center, axes))
         found, sizes = [fit_body(points, *shape, sphere=len(mirror.log_radii) == 1)], _SIZES
     others = [[torch.from_numpy(c).to(center), torch.from_numpy(a).to(axes), concave] for c, a in found]
     return [[center, size * axes, concave] for size in sizes] + others

@@ -141,8 +141,8 @@ def choose_models(capture: Capture, volumes: list[ReflectionVolume], config: Tra
         if best([without.whole, base.whole]) == 0:
             chosen["environment_width"] = 0
         taken["environment"] = [(without, base)[best([without.whole, base.whole])].name]
-    if config.guesses is None and capture.guesses() is not None:
-        base = trials.run("points that three views agree on", "stereo", chosen)
+    if config.guesses is None and capture.has_guesses:
+        base = trials.run("seen by three views", "stereo", chosen)
         filled = trials.run("guesses too", "stereo", chosen | {"guesses": True})
         chosen["guesses"] = best([base.whole, filled.whole]) == 1
         taken["stereo"] = [(base, filled)[chosen["guesses"]].name]
