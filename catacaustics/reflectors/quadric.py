@@ -169,8 +169,9 @@ def stationary(
     center: Float[Tensor, "3"],
     axes: Float[Tensor, "3 3"],
     concave: bool,
+    steps: int = _ITERATIONS // 2,
 ) -> Float[Tensor, "n 3"]:
-    """Unit vectors u of the stationary points: exact for a sphere, from there by Newton's method."""
+    """Unit vectors u of the stationary points: exact for a sphere, from there by at most `steps` of Newton's method."""
     radii = axes.norm(dim=0)
     v, w = (camera - center).expand_as(sources), sources - center
     dv, dw = v.norm(dim=1), w.norm(dim=1)
@@ -190,7 +191,7 @@ def stationary(
     # Newton's method doubles the digits: the last, differentiated step reaches the rest.
     tolerance = torch.finfo(u.dtype).eps ** 0.6
     active = torch.arange(len(u), device=u.device)
-    for _ in range(_ITERATIONS // 2):
+    for _ in range(steps):
         here = u[active]
         path, basis = path_over(center + here @ axes.T, sources[active], camera), tangents(here)
         gradient = torch.einsum("nij,ni->nj", basis, _gradient(path, axes))

@@ -25,7 +25,9 @@ from catacaustics.reflectors.fermat import (
 from catacaustics.reflectors.quadric import stationary
 from catacaustics.shapes import Float
 
-_ITERATIONS = 30
+_ROUGHLY = 1
+"""Newton steps on the ellipsoid that a start is found on."""
+_ITERATIONS = 12
 _MAX_STEP = 0.4
 """Newton steps are cut to this, in units of the mean radius."""
 _OFF = 1e-3
@@ -71,11 +73,11 @@ def profile(
 
 
 class _Level(NamedTuple):
-    """F = x^2 + y^2 - q(z), its gradient and second derivatives in world coordinates."""
+    """F = x^2 + y^2 - q(z), its gradient in world coordinates; its second derivatives are 2 - bend e e', e the axis."""
 
     value: Float[Tensor, "n"]
     gradient: Float[Tensor, "n 3"]
-    second: Float[Tensor, "n 3 3"]
+    bend: Float[Tensor, "n"]
 
 
 def _level(surface: Revolution, points: Float[Tensor, "n 3"]) -> _Level:
@@ -83,10 +85,7 @@ def _level(surface: Revolution, points: Float[Tensor, "n 3"]) -> _Level:
     q, slope, curvature = profile(surface, local[:, 2])
     across = local[:, :2]
     gradient = torch.cat([2 * across, -slope[:, None]], 1) @ surface.frame.T
-    axis = surface.frame[:, 2]
-    flat = 2 * torch.eye(3, dtype=points.dtype, device=points.device)
-    second = flat - (2 + curvature)[:, None, None] * axis[:, None] * axis
-    return _Level((across * across).sum(1) - q, gradient, second)
+    return _Level((across * across).sum(1) - q, gradient, 2 + curvature)
 
 
 def distances(surface: Revolution, points: Float[Tensor, "n 3"]) -> Float[Tensor, "n"]:
@@ -147,14 +146,13 @@ def specular_points(
         steepness = level.gradient.norm(dim=1, keepdim=True).clamp_min(1e-9 * size)
         normal = level.gradient / steepness
         basis = tangents(normal)
-        whole, multiplier = _lagrangian(path, level, steepness)
-        hessian = basis.transpose(1, 2) @ whole @ basis
+        multiplier = -((path.to_camera + path.to_source) * normal).sum(1, keepdim=True) / steepness
+        hessian, slant = _lagrangian(path, level, surface.frame[:, 2], multiplier, basis, normal)
     here, towards = _level(surface, at), path_over(at, sources, camera)
     off = (-here.value[:, None] / steepness).clamp(-_MAX_STEP * size, _MAX_STEP * size)
     rest = -(towards.to_camera + towards.to_source) - multiplier * here.gradient
-    rest = rest + torch.einsum("nij,nj->ni", whole, normal) * off
-    step = shortened(solve2(hessian, torch.einsum("nij,ni->nj", basis, rest)), _MAX_STEP * size)
-    points = at - torch.einsum("nij,nj->ni", basis, step) + normal * off
+    step = solve2(hessian, torch.einsum("nij,ni->nj", basis, rest) + slant * off)
+    points = at - torch.einsum("nij,nj->ni", basis, shortened(step, _MAX_STEP * size)) + normal * off
     if start is not None:
         return Specular(points, None, None, at)
     with torch.no_grad():
@@ -165,21 +163,28 @@ def specular_points(
     return Specular(points, visible, jacobian, at)
 
 
-def _lagrangian(path: Path, level: _Level, steepness: Tensor) -> tuple[Tensor, Tensor]:
-    """Second derivatives by x of L - m F, (n, 3, 3), and the multiplier m (n, 1)."""
-    gradient = -(path.to_camera + path.to_source)
-    multiplier = (gradient * level.gradient).sum(1, keepdim=True) / steepness**2
-    total = -multiplier[:, :, None] * level.second
-    one = torch.eye(3, dtype=gradient.dtype, device=gradient.device)
+def _lagrangian(
+    path: Path, level: _Level, axis: Tensor, multiplier: Tensor, basis: Tensor, normal: Tensor
+) -> tuple[Float[Tensor, "n 2 2"], Float[Tensor, "n 2"]]:
+    """Second derivatives of L - m F, m the multiplier: along the mirror's tangents, and along them and the normal."""
+    along = torch.einsum("nij,i->nj", basis, axis)
+    bend = multiplier * level.bend[:, None]
+    hessian = (bend * along)[:, :, None] * along[:, None, :]
+    slant = bend * (normal @ axis)[:, None] * along
+    round_part = -2 * multiplier
     for direction, distance in (path[::2], path[1::2]):
-        total = total + (one - direction[:, :, None] * direction[:, None, :]) / distance[:, :, None]
-    return total, multiplier
+        flat = torch.einsum("nij,ni->nj", basis, direction)
+        hessian = hessian - (flat / distance)[:, :, None] * flat[:, None, :]
+        slant = slant - (direction * normal).sum(1, keepdim=True) / distance * flat
+        round_part = round_part + 1 / distance
+    hessian.diagonal(dim1=1, dim2=2).add_(round_part)
+    return hessian, slant
 
 
 def _solve(sources: Tensor, camera: Tensor, surface: Revolution, size: float) -> Tensor:
     """Stationary points on the surface, by Newton's method along it from those on the ellipsoid."""
     axes = surface.frame * surface.radii
-    x = surface.center + stationary(sources, camera, surface.center, axes, False) @ axes.T
+    x = surface.center + stationary(sources, camera, surface.center, axes, False, _ROUGHLY) @ axes.T
     x = _onto(surface, x, size, 3)
     # Newton's method doubles the digits: the last, differentiated step reaches the rest.
     tolerance = size * torch.finfo(x.dtype).eps ** 0.6
@@ -188,11 +193,12 @@ def _solve(sources: Tensor, camera: Tensor, surface: Revolution, size: float) ->
         here = x[active]
         path, level = path_over(here, sources[active], camera), _level(surface, here)
         steepness = level.gradient.norm(dim=1, keepdim=True).clamp_min(1e-9 * size)
-        basis = tangents(level.gradient / steepness)
-        hessian = basis.transpose(1, 2) @ _lagrangian(path, level, steepness)[0] @ basis
-        downhill = torch.einsum("nij,ni->nj", basis, path.to_camera + path.to_source)
-        step = shortened(solve2(convex(hessian), downhill), _MAX_STEP * size)
-        moved = _onto(surface, here + torch.einsum("nij,nj->ni", basis, step), size, 1)
+        normal, uphill = level.gradient / steepness, -(path.to_camera + path.to_source)
+        basis, multiplier = tangents(normal), (uphill * normal).sum(1, keepdim=True) / steepness
+        hessian, _ = _lagrangian(path, level, surface.frame[:, 2], multiplier, basis, normal)
+        step = solve2(convex(hessian), torch.einsum("nij,ni->nj", basis, uphill))
+        step = torch.einsum("nij,nj->ni", basis, shortened(step, _MAX_STEP * size))
+        moved = _onto(surface, here - step, size, 1)
         x[active] = moved
         active = active[(moved - here).abs().amax(1) >= tolerance]
         if not len(active):
