@@ -10,12 +10,12 @@ import numpy as np
 from catacaustics.page import html_page
 
 _TITLES = {
-    "model": ("What are the reflectors?", "PSNR inside the reflector"),
-    "environment": ("Does the scene need an environment map?", "PSNR of the whole image"),
-    "stereo": ("Do stereo's guesses help where no three views agree?", "PSNR of the whole image"),
-    "reflection points": ("How many reflection points?", "PSNR inside the reflectors"),
-    "primary points": ("How many primary points?", "PSNR of the whole image"),
-    "photographs": ("Do poses or exposures need corrections?", "PSNR of the whole image, aligned"),
+    "model": ("What are the reflectors?", "PSNR inside"),
+    "environment": ("Does the scene need an environment map?", "PSNR, whole"),
+    "stereo": ("Do stereo's guesses help where no three views agree?", "PSNR, whole"),
+    "reflection points": ("How many reflection points?", "PSNR inside"),
+    "primary points": ("How many primary points?", "PSNR, whole"),
+    "photographs": ("Do poses or exposures need corrections?", "PSNR, aligned"),
 }
 
 
@@ -41,8 +41,9 @@ def choice_html(folder: Path, result: dict[str, Any], least_gain: float) -> str:
     rule = (
         "Candidates of a question stand in order of complexity. A more complex one is taken only if its mean gain over "
         f"the best so far exceeds both {least_gain:g} dB and twice the standard error of the gain per view. Scores are "
-        "means over training views that the trials did not see; every trial had the same number of steps. Where the "
-        "choice among models was close, the finalists were trained further and the rule was asked again among them."
+        "means over training views that the trials did not see, inside the reflectors or over the whole image; every "
+        "trial had the same number of steps. Where the choice among models was close, the finalists were trained "
+        "further and the rule was asked again among them."
     )
     if result["untried"]:
         rule += f" Not tried: {'; '.join(f'{rung} ({why})' for rung, why in result['untried'].items())}."
