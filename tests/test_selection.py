@@ -59,7 +59,7 @@ def chosen(tmp_path_factory):
     config = TrainConfig(
         capture, root / "run", iterations=10, image_size=64, environment_width=20, warp_width=16, refine_poses=False
     )
-    with mock.patch.object(mirrors, "_SHAPE_STEPS", 3), mock.patch.object(selection, "is_turned", return_value=True):
+    with mock.patch.object(mirrors, "_SHAPE_STEPS", 3), mock.patch.object(mirrors, "is_turned", return_value=True):
         train(config)
     return config, json.loads((root / "run" / "model_choice.json").read_text())
 
@@ -89,7 +89,7 @@ def test_a_choice_once_made_is_not_made_again(chosen, monkeypatch, capsys):
     config, choice = chosen
     (config.run / "scene.safetensors").unlink()
     (config.run / "checkpoint.safetensors").unlink()
-    monkeypatch.setattr(selection, "is_turned", lambda volume, capture: True)
+    monkeypatch.setattr(mirrors, "is_turned", lambda volume, capture: True)
     train(config)
     assert "model selection: model," not in capsys.readouterr().out
     assert json.loads((config.run / "model_choice.json").read_text()) == choice
@@ -132,16 +132,23 @@ def test_a_short_training_does_not_try_networks_and_says_so(choose, capsys):
     assert not {"neural", "quadric+neural"} & {name for name, _ in tried}
     said, page = capsys.readouterr().out, (chosen.run / "model_choice.html").read_text()
     for network in ("neural", "quadric+neural"):
-        assert f"{network} is not tried: takes more than 30 minutes" in said
+        assert f"{network} is not tried for ball: takes more than 30 minutes" in said
         assert f"{network} (takes more than 30 minutes)" in page
+
+
+def test_a_flat_reflector_is_no_ball_and_the_ellipsoid_of_a_bent_sheet_has_no_rival_in_it(choose, monkeypatch):
+    monkeypatch.setattr(mirrors, "fit_bent_sheet", lambda volume: ["a cylinder"])
+    chosen, tried = choose(lambda name, _: {"sphere": 25.0, "ellipsoid": 24.0}.get(name, 20.0))
+    assert not {"sphere", "revolution"} & {name for name, _ in tried}
+    assert chosen.model == ("ellipsoid",)
 
 
 def test_a_surface_of_revolution_is_tried_only_where_the_masks_show_one(choose, capsys, monkeypatch):
     chosen, tried = choose(lambda *_: 20.0)
     assert "revolution" not in {name for name, _ in tried}
-    assert "revolution is not tried: the masks show an ellipsoid" in capsys.readouterr().out
+    assert "revolution is not tried for ball: the masks show an ellipsoid" in capsys.readouterr().out
     shutil.rmtree(chosen.run)
-    monkeypatch.setattr(selection, "is_turned", lambda volume, capture: True)
+    monkeypatch.setattr(mirrors, "is_turned", lambda volume, capture: True)
     chosen, tried = choose(lambda name, _: 25.0 if name == "revolution" else 20.0)
     assert ("revolution", 1) in tried
     assert chosen.model == ("revolution",)

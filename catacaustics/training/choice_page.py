@@ -45,8 +45,10 @@ def choice_html(folder: Path, result: dict[str, Any], least_gain: float) -> str:
         "trial had the same number of steps. Where the choice among models was close, the finalists were trained "
         "further and the rule was asked again among them."
     )
-    if result["untried"]:
-        rule += f" Not tried: {'; '.join(f'{rung} ({why})' for rung, why in result['untried'].items())}."
+    for name, rungs in zip(reflectors, result["untried"], strict=True):
+        if rungs:
+            of = f" for {escape(name)}" if len(reflectors) > 1 else ""
+            rule += f" Not tried{of}: {'; '.join(f'{rung} ({why})' for rung, why in rungs.items())}."
     sections = []
     for question, (title, measure) in _TITLES.items():
         rows = [t for t in trials if t["question"] == question]

@@ -119,6 +119,13 @@ def off_body(points: Float[torch.Tensor, "n 3"], mirror: QuadricWarp | Revolutio
     return body_loss(quadric.distances(points, center, axes) / axes.norm(dim=0).mean())
 
 
+def impossible_shapes(volume: ReflectionVolume, capture: Capture) -> dict[str, str]:
+    """Rungs that the masks of a reflector rule out, and why."""
+    if fit_bent_sheet(volume):
+        return dict.fromkeys(("sphere", "revolution"), "the masks show something flat")
+    return {} if is_turned(volume, capture) else {"revolution": "the masks show an ellipsoid, or no turned shape"}
+
+
 def is_turned(volume: ReflectionVolume, capture: Capture) -> bool:
     """Whether a visual hull is a surface of revolution, and not an ellipsoid."""
     points = _hull_points(volume, capture)

@@ -5,7 +5,8 @@ only if its mean gain in PSNR inside the reflector exceeds both 0.2 dB and twice
 view: what the noise of a few views could explain is not a reason. The environment map, stereo's guesses and larger
 clouds must earn their place by the same rule, judged on the whole image and inside the reflectors. All trials get the
 same steps; where the choice among rungs is close, the best of them go on for twice as many, and again, and the rule is
-asked among them. Surfaces of revolution are tried where the visual hull of the masks is one and no ellipsoid.
+asked among them. What the masks rule out is not tried: spheres for flat things, surfaces
+of revolution where the visual hull is none.
 """
 
 import shutil
@@ -27,7 +28,7 @@ from catacaustics.training.choice_page import choice_html
 from catacaustics.training.corrections import align_view
 from catacaustics.training.initialize import Reflector, named_reflectors, scene_extent, usual_points
 from catacaustics.training.loop import fit
-from catacaustics.training.mirrors import is_turned
+from catacaustics.training.mirrors import impossible_shapes
 from catacaustics.training.photographs import photograph, scaled_camera
 
 LADDER = ("none", "static", "plane", "sphere", "ellipsoid", "revolution", "concave", "neural", "quadric+neural")
@@ -124,15 +125,11 @@ def choose_models(capture: Capture, volumes: list[ReflectionVolume], config: Tra
         return config
     trials = _Trials(capture, volumes, config)
     hurried = _hurried(config)  # no networks, usual sizes, an environment map, photographs as they are
-    untried = {}
-    if hurried:
-        untried |= dict.fromkeys(_NETWORKS, f"takes more than {_PATIENT} minutes")
-    if not any(is_turned(r.volume, capture) for r in reflectors if r.model == "auto"):
-        untried["revolution"] = "the masks show an ellipsoid, or no turned shape"
-    for rung, why in untried.items():
-        print(f"model selection: {rung} is not tried: {why}")
-    ladder = [rung for rung in LADDER if rung not in untried]
-    models = _models(trials, reflectors, ladder)
+    untried = [_untried(r, capture, hurried) for r in reflectors]
+    for reflector, rungs in zip(reflectors, untried, strict=True):
+        for rung, why in rungs.items():
+            print(f"model selection: {rung} is not tried for {reflector.volume.name}: {why}")
+    models = _models(trials, reflectors, untried)
     chosen: dict = {"model": tuple(models)}
     taken = {"model": models}
     if config.environment_width and not hurried:
@@ -161,21 +158,30 @@ def choose_models(capture: Capture, volumes: list[ReflectionVolume], config: Tra
     return replace(config, minutes=minutes, **chosen)
 
 
-def _models(trials: "_Trials", reflectors: list[Reflector], ladder: list[str]) -> list[str]:
+def _untried(reflector: Reflector, capture: Capture, hurried: bool) -> dict[str, str]:
+    """The rungs that a reflector cannot be, and why."""
+    if reflector.model != "auto":
+        return {}
+    networks = dict.fromkeys(_NETWORKS, f"takes more than {_PATIENT} minutes") if hurried else {}
+    return networks | impossible_shapes(reflector.volume, capture)
+
+
+def _models(trials: "_Trials", reflectors: list[Reflector], untried: list[dict[str, str]]) -> list[str]:
     """A rung for each reflector, by trials that get longer for fewer; in a trial all reflectors to be decided have the
     same one."""
 
     def run(left: dict[int, list[int]], rounds: int) -> dict[int, list[list[float | None]]]:
-        tried = {k: {"model": _filled(reflectors, ladder[k])} for k in sorted(set().union(*left.values()))}
-        done = {k: trials.run(ladder[k], "model", settings, rounds) for k, settings in tried.items()}
+        tried = {k: {"model": _filled(reflectors, LADDER[k])} for k in sorted(set().union(*left.values()))}
+        done = {k: trials.run(LADDER[k], "model", settings, rounds) for k, settings in tried.items()}
         return {i: [done[k].inside[i] for k in rungs] for i, rungs in left.items()}
 
-    left = {i: list(range(len(ladder))) for i, r in enumerate(reflectors) if r.model == "auto"}
+    free = [i for i, r in enumerate(reflectors) if r.model == "auto"]
+    left = {i: [k for k, rung in enumerate(LADDER) if rung not in untried[i]] for i in free}
     scores = run(left, 1)
     for turn, most in enumerate(_FINALISTS, 1):
         left |= {i: [left[i][k] for k in finalists(scores[i], most)] for i in scores}
         scores = run({i: rungs for i, rungs in left.items() if len(rungs) > 1}, 2**turn)
-    taken = {i: ladder[rungs[best(scores[i]) if i in scores else 0]] for i, rungs in left.items()}
+    taken = {i: LADDER[rungs[best(scores[i]) if i in scores else 0]] for i, rungs in left.items()}
     return [taken.get(i, r.model) for i, r in enumerate(reflectors)]
 
 
@@ -269,7 +275,9 @@ class _Trials:
         write_json(self.run_folder / "model_choice.json", {"key": self._key, "trials": [asdict(t) for t in self.done]})
         return trial
 
-    def finish(self, chosen: dict, taken: dict[str, list[str]], reflectors: list[str], untried: dict[str, str]) -> None:
+    def finish(
+        self, chosen: dict, taken: dict[str, list[str]], reflectors: list[str], untried: list[dict[str, str]]
+    ) -> None:
         result = {
             "key": self._key,
             "chosen": _plain(chosen),
