@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
-from scipy.spatial import ConvexHull, cKDTree
+from scipy.spatial import ConvexHull, KDTree
 
 from catacaustics.geometry import normalize, sphere_directions
 from catacaustics.refraction.frames import Frame
@@ -67,6 +67,11 @@ class Sight(NamedTuple):
     to_clip: Float[np.ndarray, "4 4"]
     mask: Bool[np.ndarray, "h w"]
     depth: Float[np.ndarray, "h w"]
+
+
+def spread(count: int) -> list[int]:
+    """Numbers of the frames that bodies are baked from."""
+    return [i * count // min(count, _FRAMES) for i in range(min(count, _FRAMES))]
 
 
 def bake_bodies(frames: Sequence[Frame]) -> list[Surface | None]:
@@ -153,7 +158,7 @@ def refuted(points: Float[np.ndarray, "n 3"], sights: Sequence[Sight], tolerance
 
 def _additions(known: Cloud, more: Cloud, cell: float, sights: Sequence[Sight]) -> Cloud | None:
     """What `more` tells of places that are not known yet; None where it contradicts what is known or seen."""
-    distance, nearest = cKDTree(known.points).query(more.points)
+    distance, nearest = KDTree(known.points).query(more.points)
     same = distance < _NEAR * cell
     against = (known.normals[nearest] * more.normals).sum(-1) < -0.5
     new = more.at(~same)
@@ -250,7 +255,7 @@ def _poisson_surface(known: Cloud, cell: float) -> Surface:
     mesh, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=_POISSON_DEPTH, n_threads=1)
     mesh.compute_vertex_normals()
     vertices, faces, normals = (np.array(v) for v in (mesh.vertices, mesh.triangles, mesh.vertex_normals))
-    distance, nearest = cKDTree(known.points).query(vertices, k=4)
+    distance, nearest = KDTree(known.points).query(vertices, k=4)
     offset = ((vertices[:, None] - known.points[nearest]) * known.normals[nearest]).sum(-1)
     alike = (known.normals[nearest] * known.normals[nearest[:, :1]]).sum(-1) > _SMOOTH
     weight = alike / np.maximum(distance, 0.1 * cell) ** 2

@@ -1,6 +1,6 @@
 """Specular paths through baked bodies, where poses place them: the tracer of hybrid. No network bends a ray."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -9,35 +9,46 @@ from torch import Tensor, nn
 from torch.nn.functional import softplus
 
 from catacaustics.geometry import normalize
-from catacaustics.refraction.bodies import Surface
-from catacaustics.refraction.buffers import Buffers
+from catacaustics.refraction.bodies import Surface, bake_bodies
+from catacaustics.refraction.buffers import Buffers, frame_buffers
+from catacaustics.refraction.frames import Frame
 from catacaustics.refraction.networks import TURNS, Size, encode, flat, layers, precise
+from catacaustics.refraction.optics import fresnel
 from catacaustics.refraction.trace import Hits, Landings, Media, land
-from catacaustics.shapes import Bool, Float, Int
+from catacaustics.shapes import Bool, Float
 
 _ASTRAY = 0.01
-"""Where the baked surface is farther than this from what the G-buffer shows first, the G-buffer counts (scene units)."""
+"""Where the baked surface is farther than this from what the G-buffer shows first, that counts (scene units)."""
+_AWAY = 1e-4
+"""How far off the first surface its reflections start (scene units): a G-buffer rounds places to 2e-5."""
 _STEP = 0.02
 """Neighbouring pixels whose points are farther than this from each other's tangent planes do not show one surface."""
+_TRIED, _OFF = 16, np.radians(5)
+"""Frames whose landing points are compared with paths, and how far a path may be off to count as right."""
 _CORNERS = 16
 """Vertices of a body that are asked for, to tell whether another encloses it."""
-TRACED_CHANNELS = 8
-"""Of a tracer's output: normal and place where paths land, the share of light on them, and whether the screen shows
-that place."""
+TRACED_CHANNELS = 12
+"""Of a tracer's output: normal and place where paths land, the share of light on them, whether the screen shows that
+place; place where the reflection off the first surface lands, and the share of light on it."""
+
+
+def _open3d() -> Any:
+    import open3d
+
+    return open3d
+
+
+def _tensor(values: np.ndarray) -> Any:
+    return _open3d().core.Tensor(np.ascontiguousarray(values))
 
 
 class Mesh:
     """A triangle mesh that rays are cast at, by open3d (Embree)."""
 
     def __init__(self, surface: Surface):
-        import open3d as o3d
-
         self.surface = surface
-        self.scene: Any = o3d.t.geometry.RaycastingScene(nthreads=1)
-        self.scene.add_triangles(
-            o3d.core.Tensor(np.ascontiguousarray(surface.vertices, np.float32)),
-            o3d.core.Tensor(np.ascontiguousarray(surface.faces, np.uint32)),
-        )
+        self.scene = _open3d().t.geometry.RaycastingScene(nthreads=1)
+        self.scene.add_triangles(_tensor(surface.vertices.astype(np.float32)), _tensor(surface.faces.astype(np.uint32)))
         some = np.linspace(0, len(surface.vertices) - 1, _CORNERS).astype(int)
         self.corners = surface.vertices[some]
 
@@ -45,10 +56,8 @@ class Mesh:
         self, origins: Float[np.ndarray, "n 3"], directions: Float[np.ndarray, "n 3"]
     ) -> tuple[Float[np.ndarray, "n"], Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
         """Distance (infinite: nothing), normal of the face and for shading; in the mesh's coordinates."""
-        import open3d as o3d
-
         rays = np.concatenate([origins, directions], -1, dtype=np.float32)
-        found = self.scene.cast_rays(o3d.core.Tensor(rays), nthreads=1)
+        found = self.scene.cast_rays(_tensor(rays), nthreads=1)
         distance = found["t_hit"].numpy().astype(float)
         hit = np.isfinite(distance)
         normal, shading = np.zeros((2, len(rays), 3))
@@ -62,9 +71,7 @@ class Mesh:
 
     def encloses(self, points: Float[np.ndarray, "n 3"]) -> bool:
         """Whether points all lie inside the closed mesh."""
-        import open3d as o3d
-
-        inside = self.scene.compute_occupancy(o3d.core.Tensor(points.astype(np.float32)), nthreads=1)
+        inside = self.scene.compute_occupancy(_tensor(points.astype(np.float32)), nthreads=1)
         return bool((inside.numpy() > 0.5).all())
 
 
@@ -140,6 +147,18 @@ def seen_mesh(position: Float[np.ndarray, "h w 3"], normal: Float[np.ndarray, "h
     return Mesh(Surface(points, faces[whole], normals[faces[whole]]))
 
 
+class Ends(NamedTuple):
+    """Where paths leave the glass and which way, the share of light on them (0: they land nowhere), whether the screen
+    shows where they land; and if so, normal and place."""
+
+    start: Float[np.ndarray, "n 3"]
+    direction: Float[np.ndarray, "n 3"]
+    light: Float[np.ndarray, "n"]
+    seen: Bool[np.ndarray, "n"]
+    normal: Float[np.ndarray, "n 3"]
+    place: Float[np.ndarray, "n 3"]
+
+
 class Tracer(nn.Module):
     """hybrid's R-buffer generator: paths are followed through baked bodies; learned is only how far it is from where
     they leave the glass to what the screen does not show, and the normal there.
@@ -170,45 +189,69 @@ class Tracer(nn.Module):
             self._meshes = [None if p[0] is None else Mesh(Surface(*p)) for p in parts]  # pyright: ignore[reportArgumentType]
         return self._meshes
 
-    def forward(self, buffers: Buffers) -> Float[Tensor, "b 8 h w"]:
+    def forward(self, buffers: Buffers) -> Float[Tensor, "b 12 h w"]:
         """TRACED_CHANNELS; zero where there is no glass, and where a path lands nowhere. In training the screen is not
         looked at: what lies beyond is learned everywhere."""
         covered = buffers.covered[:, 0]
-        parts = [self._follow(i, buffers, covered[i]) for i in range(len(covered))]
-        start, direction = (torch.cat(v) for v in list(zip(*parts, strict=True))[:2])
-        found = torch.cat([part[2] for part in parts])
-        beyond = found[:, 7] == 0
-        x = torch.cat([encode(start[beyond], self.octaves), encode(direction[beyond], TURNS)], -1)
-        distance, normal = precise(self.leave, self.reach(x)).split([1, 3], -1)
-        place = start[beyond] + softplus(distance) * direction[beyond]
-        lands = found[beyond, 6:7] > 0
-        found = found.index_copy(
-            0, beyond.nonzero()[:, 0], torch.cat([normal * lands, place * lands, found[beyond, 6:]], -1)
+        parts = [self._follow(Buffers(*(v[i : i + 1].cpu() for v in buffers))) for i in range(len(covered))]
+        through, mirrored = (
+            Ends(*(np.concatenate(v) for v in zip(*ends, strict=True))) for ends in zip(*parts, strict=True)
         )
+        found = self._landed(through, buffers.rays)
+        seen = found.new_tensor(through.seen)[:, None]
+        found = torch.cat([found, seen, self._landed(mirrored, buffers.rays)[:, 3:]], -1)
         whole = found.new_zeros(*covered.shape, TRACED_CHANNELS)
         whole[covered] = found
         return whole.movedim(-1, 1)
 
-    def _follow(self, i: int, buffers: Buffers, covered: Bool[Tensor, "h w"]) -> tuple[Tensor, Tensor, Tensor]:
-        """Of one frame's pixels with glass: where paths leave it, which way, and what is known of where they land."""
-        one = Buffers(*(value[i : i + 1].cpu() for value in buffers))
-        pixels = covered.cpu().numpy()
+    def _landed(self, ends: "Ends", like: Tensor) -> Float[Tensor, "n 7"]:
+        """Normal, place and share of light."""
+        start, direction, light, seen, normal, place = (like.new_tensor(values) for values in ends)
+        x = torch.cat([encode(start, self.octaves), encode(direction, TURNS)], -1)
+        distance, beyond = precise(self.leave, self.reach(x)).split([1, 3], -1)
+        seen, lands = seen[:, None] > 0, light[:, None] > 0
+        normal = torch.where(seen, normal, beyond)
+        place = torch.where(seen, place, start + softplus(distance) * direction)
+        return torch.cat([normal * lands, place * lands, light[:, None]], -1)
+
+    def _follow(self, one: Buffers) -> tuple["Ends", "Ends"]:
+        """The ends of one frame's paths, and of the reflections off the first surface."""
+        pixels = one.covered[0, 0].numpy()
         stand, slots = self._stand(one)
         rays = normalize(_pixels(one.rays)[pixels].astype(float))
-        camera = camera_position(one.world_to_clip[0].double().numpy())
-        found = follow(stand, camera, rays, _first_hits(one, pixels, slots))
-        lands, seen = found.body >= 0, found.body == stand.opaque
-        beyond = found.body == stand.beyond
-        direction = np.where(beyond[:, None], -found.normal, rays)
-        start = np.where(beyond[:, None], found.position - direction, 0)
-        shown = seen[:, None]
-        known = [found.normal * shown, found.position * shown, (found.light * lands)[:, None], shown]
-        to = buffers.rays
-        return (
-            to.new_tensor(start),
-            to.new_tensor(direction),
-            to.new_tensor(np.concatenate(known, -1)),
+        camera = np.broadcast_to(camera_position(one.world_to_clip[0].double().numpy()), rays.shape)
+        shown = _first_hits(one, pixels, slots)
+        met = stand.intersect(camera, rays)
+        near = (met.body == shown.body) & (np.abs(met.distance - shown.distance) < _ASTRAY)
+        first = shown._replace(distance=np.where(near, met.distance, shown.distance))
+        through = land(stand.intersect, stand.media, camera, rays, first=first)
+        cosine = -(rays * first.shading).sum(-1)
+        share, _ = fresnel(np.maximum(cosine, 0), stand.media.inner[first.body] / stand.media.outer[first.body])
+        mirror = normalize(rays + 2 * cosine[:, None] * first.shading)
+        away = camera + first.distance[:, None] * rays + _AWAY * first.shading
+        reflected = stand.intersect(away, mirror)
+        lands = (reflected.body == stand.opaque) | (reflected.body == stand.beyond)
+        mirrored = Ends(
+            away,
+            mirror,
+            np.where(lands & (share < 0.5), share, 0),
+            reflected.body == stand.opaque,
+            reflected.shading,
+            away + reflected.distance[:, None] * mirror,
         )
+        return _ends(stand, through), mirrored
+
+    def aim(self, one: Buffers) -> Float[np.ndarray, "n"]:
+        """Angles, in radians, between where one frame's paths leave the glass and where they land in truth; pi for
+        those that do not leave it."""
+        stand_alone = self.training
+        ends, _ = self.train()._follow(one)
+        self.train(stand_alone)
+        pixels = one.covered[0, 0].numpy()
+        lands = one.landing_object[0].numpy()[pixels] >= 0
+        way = normalize(_pixels(one.landing)[pixels] - ends.start + 1e-12)
+        angle = np.arccos(np.clip((way * ends.direction).sum(-1), -1, 1))
+        return np.where(ends.light > 0, angle, np.pi)[lands]
 
     def _stand(self, one: Buffers) -> tuple[Stand, list[int]]:
         """The frame's bodies as they stand, and each object's place among them (-1: not baked or not seen)."""
@@ -224,15 +267,13 @@ class Tracer(nn.Module):
         return Stand(bodies, seen), slots
 
 
-def follow(
-    stand: Stand, camera: Float[np.ndarray, "3"], rays: Float[np.ndarray, "n 3"], shown: Hits
-) -> Landings:
-    """Paths of a camera's rays that meet glass first; `shown` is what the G-buffers say of that."""
-    origins = np.broadcast_to(camera, rays.shape)
-    met = stand.intersect(origins, rays)
-    near = (met.body == shown.body) & (np.abs(met.distance - shown.distance) < _ASTRAY)
-    first = shown._replace(distance=np.where(near, met.distance, shown.distance))
-    return land(stand.intersect, stand.media, origins, rays, first=first)
+def _ends(stand: Stand, found: Landings) -> Ends:
+    beyond = (found.body == stand.beyond)[:, None]
+    direction = np.where(beyond, -found.normal, 0)
+    start = np.where(beyond, found.position - direction, 0)
+    return Ends(
+        start, direction, found.light * (found.body >= 0), found.body == stand.opaque, found.normal, found.position
+    )
 
 
 def _first_hits(one: Buffers, pixels: Bool[np.ndarray, "h w"], slots: list[int]) -> Hits:
@@ -254,3 +295,32 @@ def camera_position(world_to_clip: Float[np.ndarray, "4 4"]) -> Float[np.ndarray
 
 def _pixels(image: Float[Tensor, "1 c h w"]) -> Float[np.ndarray, "h w c"]:
     return image[0].movedim(0, -1).numpy()
+
+
+def tracer_like(weights: Mapping[str, Tensor], size: Size) -> Tracer | None:
+    """A tracer with room for these weights; None where they are not those of one."""
+    count = 1 + max((int(name.split("_")[1]) for name in weights if name.startswith("body_")), default=-1)
+    if not count:
+        return None
+    stored = [[weights.get(f"body_{i}_{name}") for name in Surface._fields] for i in range(count)]
+    surfaces = [
+        Surface(*(p.numpy() for p in parts if p is not None)) if parts[0] is not None else None for parts in stored
+    ]
+    return Tracer(surfaces, size)
+
+
+def bake_tracer(frames: Sequence[Frame], size: Size) -> tuple[Tracer | None, str]:
+    """A tracer through the bodies that frames show, or None where paths through them do not lead to the landing points
+    of these frames; and a line on which it is."""
+    surfaces = bake_bodies(frames)
+    if not any(surfaces):
+        return None, "no body can be baked: too few frames show one; a network learns the paths instead"
+    tracer = Tracer(surfaces, size)
+    right = total = 0
+    for frame in frames[:: max(1, len(frames) // _TRIED)]:
+        aimed = tracer.aim(frame_buffers(frame))
+        right, total = right + int((aimed < _OFF).sum()), total + len(aimed)
+    said = f"paths through {sum(s is not None for s in surfaces)} baked bodies lead to {right / max(total, 1):.0%}"
+    if right < 0.5 * total:
+        return None, f"{said} of the landing points (50 % are asked for); a network learns the paths instead"
+    return tracer, f"{said} of the landing points"

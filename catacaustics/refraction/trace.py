@@ -44,8 +44,8 @@ class Media(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Landings:
-    """Where paths land. Where they do not, `body` is -1 and the rest zero; `refractive`, `events` and `light` (the share
-    of it that takes the path, by Fresnel) are always set."""
+    """Where paths land. Where they do not, `body` is -1 and the rest zero; `refractive`, `events` and `light` (its
+    share that takes the path, by Fresnel) are always set."""
 
     refractive: Bool[np.ndarray, "n"]
     position: Float[np.ndarray, "n 3"]
