@@ -116,12 +116,17 @@ def _seen(frame: Frame, body: int) -> Cloud:
 
 
 def _sight(frame: Frame, body: int) -> Sight:
-    """Masks grow by a pixel and depths shrink to the nearest neighbour's: a point between pixels belongs to both."""
     pose = np.vstack([frame.object_to_world[body], [0, 0, 0, 1]]).astype(float)
     clip = frame.world_to_clip.astype(float)
     depth = frame.object_position[body] @ clip[3, :3] + clip[3, 3]
-    depth = minimum_filter(np.where(frame.object_mask[body], depth, np.inf), 3)
-    return Sight(clip @ pose, maximum_filter(frame.object_mask[body], 3), depth)
+    return make_sight(clip @ pose, frame.object_mask[body], depth)
+
+
+def make_sight(
+    to_clip: Float[np.ndarray, "4 4"], mask: Bool[np.ndarray, "h w"], depth: Float[np.ndarray, "h w"]
+) -> Sight:
+    """The mask grows by a pixel, depths become the nearest neighbour's: a point between pixels belongs to both."""
+    return Sight(to_clip, maximum_filter(mask, 3), minimum_filter(np.where(mask, depth, np.inf), 3))
 
 
 def _joined(parts: Sequence[Cloud]) -> Cloud:
@@ -254,8 +259,10 @@ def _poisson_surface(known: Cloud, cell: float) -> Surface:
     cloud.normals = o3d.utility.Vector3dVector(known.normals)
     mesh, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=_POISSON_DEPTH, n_threads=1)
     mesh.compute_vertex_normals()
-    vertices, faces, normals = (np.array(v) for v in (mesh.vertices, mesh.triangles, mesh.vertex_normals))
-    distance, nearest = KDTree(known.points).query(vertices, k=4)
+    vertices, normals = np.array(mesh.vertices), np.array(mesh.vertex_normals)
+    faces: np.ndarray = np.array(mesh.triangles)
+    found: tuple[np.ndarray, np.ndarray] = KDTree(known.points).query(vertices, k=4)  # pyright: ignore[reportAssignmentType]
+    distance, nearest = found
     offset = ((vertices[:, None] - known.points[nearest]) * known.normals[nearest]).sum(-1)
     alike = (known.normals[nearest] * known.normals[nearest[:, :1]]).sum(-1) > _SMOOTH
     weight = alike / np.maximum(distance, 0.1 * cell) ** 2

@@ -8,7 +8,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import cross_entropy, normalize, one_hot
+from torch.nn.functional import avg_pool2d, cross_entropy, interpolate, normalize, one_hot
 
 from catacaustics.errors import UserError
 from catacaustics.files import read_tensors, write_tensors
@@ -101,8 +101,8 @@ def output_channels(kind: Kind, textures: int) -> int:
 
 
 def r_channels(kind: Kind | None) -> int:
-    """Of an R-buffer: colour and normal at the landing point; hybrid's goes on with what `_traced_channels` tells."""
-    return {None: 0, "hybrid": 10}.get(kind, 6)
+    """Of an R-buffer: colour and normal at the landing point; hybrid's goes on (`_further_channels`)."""
+    return {None: 0, "hybrid": 19}.get(kind, 6)
 
 
 def split_output(kind: Kind, output: Float[Tensor, "b c h w"]) -> Prediction:
@@ -202,13 +202,11 @@ def landing_color(
     assert screen is not None, "this kind looks colours up on the screen"
     if prediction.ndc is not None:
         return sample_screen(screen.color, prediction.ndc)
-    ndc, depth = project(prediction.world, buffers.world_to_clip)
-    by_screen = sample_screen(screen.color, ndc)
-    if kind == "world":
-        return by_screen
-    share = prediction.traced.seen if prediction.traced else shown_share(screen, ndc, depth)
-    by_probe = sample_probe(screen.probe, screen.probe_position, prediction.world)
-    return share * by_screen + (1 - share) * by_probe
+    if kind == "hybrid":
+        seen = prediction.traced.seen if prediction.traced else None
+        return _color_at(prediction.world, seen, buffers.world_to_clip, screen)
+    ndc, _ = project(prediction.world, buffers.world_to_clip)
+    return sample_screen(screen.color, ndc)
 
 
 def shown_share(screen: Screen, ndc: Tensor, depth: Tensor) -> Float[Tensor, "b 1 h w"]:
@@ -216,17 +214,32 @@ def shown_share(screen: Screen, ndc: Tensor, depth: Tensor) -> Float[Tensor, "b 
     return inside_screen(ndc, EDGE) * visibility(screen.depth, ndc, depth, TOLERANCE)
 
 
-def _traced_channels(prediction: Prediction, buffers: Buffers, screen: Screen) -> Float[Tensor, "b 4 h w"]:
-    """Share of light on the path, and the colour mirrored by the first surface times its share; zero where no tracer
-    was at work."""
-    traced = prediction.traced
-    if traced is None:
-        return torch.zeros_like(buffers.reference[:, :1]).expand(-1, 4, -1, -1)
-    ndc, depth = project(traced.mirrored, buffers.world_to_clip)
-    share = shown_share(screen, ndc, depth)
-    by_probe = sample_probe(screen.probe, screen.probe_position, traced.mirrored)
-    color = share * sample_screen(screen.color, ndc) + (1 - share) * by_probe
-    return torch.cat([traced.light, traced.mirrored_light * color], 1)
+def _color_at(
+    world: Float[Tensor, "b 3 h w"], seen: Tensor | None, world_to_clip: Tensor, screen: Screen
+) -> Float[Tensor, "b 3 h w"]:
+    """hybrid's lookup: on the screen as far as it shows points (`seen`; None: by its depth), else by the probe."""
+    ndc, depth = project(world, world_to_clip)
+    share = shown_share(screen, ndc, depth) if seen is None else seen
+    by_probe = sample_probe(screen.probe, screen.probe_position, world)
+    return share * sample_screen(screen.color, ndc) + (1 - share) * by_probe
+
+
+def _further_channels(prediction: Prediction, buffers: Buffers, screen: Screen) -> Float[Tensor, "b 13 h w"]:
+    """What hybrid's renderer gets beside colour and normal.
+
+    The mean colour of four points in each pixel, between whose centres landing points are interpolated; direct lighting
+    of the landing point where the screen shows it; the point; and where a tracer was at work, the share of light on the
+    path, and the colour that the first surface mirrors times its share.
+    """
+    clip, traced = buffers.world_to_clip, prediction.traced
+    ndc, depth = project(prediction.world, clip)
+    seen = traced.seen if traced else shown_share(screen, ndc, depth)
+    finer = interpolate(torch.cat([prediction.world, seen], 1), scale_factor=2, mode="bilinear", align_corners=False)
+    mean = avg_pool2d(_color_at(finer[:, :3], finer[:, 3:], clip, screen), 2)
+    light, mirrored = torch.zeros_like(seen), torch.zeros_like(mean)
+    if traced:
+        light, mirrored = traced.light, traced.mirrored_light * _color_at(traced.mirrored, None, clip, screen)
+    return torch.cat([mean, seen * sample_screen(buffers.direct, ndc), prediction.world, light, mirrored], 1)
 
 
 def r_buffer(
@@ -235,7 +248,7 @@ def r_buffer(
     """Colour and normal at the landing points, then hybrid's further channels; zero where there is no glass."""
     parts = [landing_color(kind, prediction, buffers, screen, textures), prediction.normal]
     if kind == "hybrid" and screen is not None:
-        parts.append(_traced_channels(prediction, buffers, screen))
+        parts.append(_further_channels(prediction, buffers, screen))
     return torch.cat(parts, 1) * buffers.covered
 
 

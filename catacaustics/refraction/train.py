@@ -167,7 +167,7 @@ def _bake(model: RefractionModel, cache: BufferCache, config: RefractTrainConfig
 
 def _without_screen(frame: Frame) -> Frame:
     """Lighter by what bodies do not need."""
-    return replace(frame, screen=frame.screen[:0], screen_depth=frame.screen_depth[:0], probe=frame.probe[:0])
+    return replace(frame, screen=frame.screen[:0, :0], screen_depth=frame.screen_depth[:0, :0], probe=frame.probe[:0])
 
 
 # What a step learns ----------------------------------------------------------------------------------------------
