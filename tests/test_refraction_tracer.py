@@ -178,6 +178,12 @@ def test_a_body_of_which_a_few_points_were_seen_is_not_baked():
     assert bake_body(cloud, [sight]) is None
 
 
+def test_a_body_of_which_one_flat_face_was_seen_is_not_baked():
+    places = np.random.default_rng(0).uniform(-0.4, 0.4, (3000, 2))
+    face = Cloud(np.insert(places, 2, 0.0, axis=1), np.broadcast_to([0.0, 0.0, 1.0], (3000, 3)))
+    assert bake_body(face, []) is None
+
+
 # Frames ----------------------------------------------------------------------------------------------------------
 
 
@@ -274,7 +280,7 @@ def test_hybrid_trains_a_tracer_that_is_the_same_when_loaded_and_no_other_model_
     config = RefractTrainConfig(data, tmp_path / "run", steps=20, batch=2, crop=16)
     model = train(config)
     assert isinstance(model.generator, Tracer)
-    assert "paths through 1 baked bodies lead to" in capsys.readouterr().out
+    assert "paths through 1 of 1 bodies" in capsys.readouterr().out
     frames = open_frames(data)
     loaded = load_model(config.run, frames)
     frame = frames.split("test")[0]
@@ -283,7 +289,7 @@ def test_hybrid_trains_a_tracer_that_is_the_same_when_loaded_and_no_other_model_
     assert torch.equal(*images)
     view = render_frame(loaded, frame)
     shown = landing_regions(frame)["seen"]
-    assert np.abs(view.looked_up - view.true_color)[shown].mean() < 0.05
+    assert np.abs(view.looked_up - view.true_color)[shown].mean() < 0.1  # 20 texels a checker, a pixel covers many
     ssnrb = replace(config, run=tmp_path / "b", model="ssnrb", generator=config.run / "generator.safetensors")
     with pytest.raises(UserError, match="generator of hybrid"):
         train(ssnrb)

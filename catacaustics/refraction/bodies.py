@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.ndimage import maximum_filter, minimum_filter
-from scipy.spatial import ConvexHull, KDTree
+from scipy.spatial import ConvexHull, KDTree, QhullError
 
 from catacaustics.geometry import normalize, sphere_directions
 from catacaustics.refraction.frames import Frame
@@ -75,7 +75,7 @@ def spread(count: int) -> list[int]:
 
 
 def bake_bodies(frames: Sequence[Frame]) -> list[Surface | None]:
-    """The surfaces of a scene's transparent bodies, None for a body that hardly any frame shows."""
+    """The surfaces of a scene's transparent bodies, None for one of which frames show too little."""
     clouds: list[list[Cloud]] = []
     sights: list[list[Sight]] = []
     for number, frame in enumerate(frames):
@@ -93,7 +93,8 @@ def bake_bodies(frames: Sequence[Frame]) -> list[Surface | None]:
 
 
 def bake_body(seen: Cloud, sights: Sequence[Sight]) -> Surface | None:
-    """The surface of a body from its seen points, which `sights` may refuse to have completed in some way."""
+    """The surface of a body from its seen points, which `sights` may refuse to have completed in some way; None where
+    few are seen, or one flat face alone."""
     extent = np.ptp(seen.points, axis=0).max()
     cell = extent / CELLS
     seen = thinned(seen, cell)
@@ -101,7 +102,10 @@ def bake_body(seen: Cloud, sights: Sequence[Sight]) -> Surface | None:
         return None
     known = mirrored(seen, cell, sights)
     known = with_sphere(known, cell, sights)
-    hull = ConvexHull(known.points)
+    try:
+        hull = ConvexHull(known.points)
+    except QhullError:
+        return None
     if convex(known, hull, extent):
         return _hull_surface(known, hull)
     return _poisson_surface(known, cell)

@@ -193,7 +193,8 @@ class Tracer(nn.Module):
         """TRACED_CHANNELS; zero where there is no glass, and where a path lands nowhere. In training the screen is not
         looked at: what lies beyond is learned everywhere."""
         covered = buffers.covered[:, 0]
-        parts = [self._follow(Buffers(*(v[i : i + 1].cpu() for v in buffers))) for i in range(len(covered))]
+        frames = [Buffers(*(v[i : i + 1].cpu() for v in buffers)) for i in range(len(covered))]
+        parts = [self._follow(one, look=not self.training) for one in frames]
         through, mirrored = (
             Ends(*(np.concatenate(v) for v in zip(*ends, strict=True))) for ends in zip(*parts, strict=True)
         )
@@ -204,7 +205,7 @@ class Tracer(nn.Module):
         whole[covered] = found
         return whole.movedim(-1, 1)
 
-    def _landed(self, ends: "Ends", like: Tensor) -> Float[Tensor, "n 7"]:
+    def _landed(self, ends: Ends, like: Tensor) -> Float[Tensor, "n 7"]:
         """Normal, place and share of light."""
         start, direction, light, seen, normal, place = (like.new_tensor(values) for values in ends)
         x = torch.cat([encode(start, self.octaves), encode(direction, TURNS)], -1)
@@ -214,10 +215,11 @@ class Tracer(nn.Module):
         place = torch.where(seen, place, start + softplus(distance) * direction)
         return torch.cat([normal * lands, place * lands, light[:, None]], -1)
 
-    def _follow(self, one: Buffers) -> tuple["Ends", "Ends"]:
-        """The ends of one frame's paths, and of the reflections off the first surface."""
+    def _follow(self, one: Buffers, look: bool) -> tuple[Ends, Ends]:
+        """The ends of one frame's paths, and of the reflections off the first surface; `look` at what the screen shows
+        of the opaque scene."""
         pixels = one.covered[0, 0].numpy()
-        stand, slots = self._stand(one)
+        stand, slots = self._stand(one, look)
         rays = normalize(_pixels(one.rays)[pixels].astype(float))
         camera = np.broadcast_to(camera_position(one.world_to_clip[0].double().numpy()), rays.shape)
         shown = _first_hits(one, pixels, slots)
@@ -225,35 +227,19 @@ class Tracer(nn.Module):
         near = (met.body == shown.body) & (np.abs(met.distance - shown.distance) < _ASTRAY)
         first = shown._replace(distance=np.where(near, met.distance, shown.distance))
         through = land(stand.intersect, stand.media, camera, rays, first=first)
-        cosine = -(rays * first.shading).sum(-1)
-        share, _ = fresnel(np.maximum(cosine, 0), stand.media.inner[first.body] / stand.media.outer[first.body])
-        mirror = normalize(rays + 2 * cosine[:, None] * first.shading)
-        away = camera + first.distance[:, None] * rays + _AWAY * first.shading
-        reflected = stand.intersect(away, mirror)
-        lands = (reflected.body == stand.opaque) | (reflected.body == stand.beyond)
-        mirrored = Ends(
-            away,
-            mirror,
-            np.where(lands & (share < 0.5), share, 0),
-            reflected.body == stand.opaque,
-            reflected.shading,
-            away + reflected.distance[:, None] * mirror,
-        )
-        return _ends(stand, through), mirrored
+        return _ends(stand, through), _mirrored(stand, camera, rays, first)
 
     def aim(self, one: Buffers) -> Float[np.ndarray, "n"]:
         """Angles, in radians, between where one frame's paths leave the glass and where they land in truth; pi for
         those that do not leave it."""
-        stand_alone = self.training
-        ends, _ = self.train()._follow(one)
-        self.train(stand_alone)
+        ends, _ = self._follow(one, look=False)
         pixels = one.covered[0, 0].numpy()
         lands = one.landing_object[0].numpy()[pixels] >= 0
         way = normalize(_pixels(one.landing)[pixels] - ends.start + 1e-12)
         angle = np.arccos(np.clip((way * ends.direction).sum(-1), -1, 1))
         return np.where(ends.light > 0, angle, np.pi)[lands]
 
-    def _stand(self, one: Buffers) -> tuple[Stand, list[int]]:
+    def _stand(self, one: Buffers, look: bool) -> tuple[Stand, list[int]]:
         """The frame's bodies as they stand, and each object's place among them (-1: not baked or not seen)."""
         bodies, slots = [], []
         for pose, number in zip(one.poses[0].double().numpy(), one.bodies[0].tolist(), strict=True):
@@ -263,11 +249,25 @@ class Tracer(nn.Module):
                 continue
             slots.append(len(bodies))
             bodies.append(Placed(mesh, pose[:9].reshape(3, 3), pose[9:12], pose[12], pose[13]))
-        seen = None if self.training else seen_mesh(_pixels(one.position), _pixels(one.normal))
+        seen = seen_mesh(_pixels(one.position), _pixels(one.normal)) if look else None
         return Stand(bodies, seen), slots
 
 
+def _mirrored(stand: Stand, origins: Float[np.ndarray, "n 3"], rays: Float[np.ndarray, "n 3"], first: Hits) -> Ends:
+    """Reflections off the first surface, no farther than to the next one; those that are the path itself, because they
+    carry more than half of the light, are left out."""
+    cosine = -(rays * first.shading).sum(-1)
+    share, _ = fresnel(np.maximum(cosine, 0), stand.media.inner[first.body] / stand.media.outer[first.body])
+    directions = normalize(rays + 2 * cosine[:, None] * first.shading)
+    start = origins + first.distance[:, None] * rays + _AWAY * first.shading
+    hits = stand.intersect(start, directions)
+    seen = hits.body == stand.opaque
+    light = np.where((seen | (hits.body == stand.beyond)) & (share < 0.5), share, 0)
+    return Ends(start, directions, light, seen, hits.shading, start + hits.distance[:, None] * directions)
+
+
 def _ends(stand: Stand, found: Landings) -> Ends:
+    """The ends of paths: `Stand` lets those that land beyond do so at distance 1, with the normal against them."""
     beyond = (found.body == stand.beyond)[:, None]
     direction = np.where(beyond, -found.normal, 0)
     start = np.where(beyond, found.position - direction, 0)
@@ -320,7 +320,8 @@ def bake_tracer(frames: Sequence[Frame], size: Size) -> tuple[Tracer | None, str
     for frame in frames[:: max(1, len(frames) // _TRIED)]:
         aimed = tracer.aim(frame_buffers(frame))
         right, total = right + int((aimed < _OFF).sum()), total + len(aimed)
-    said = f"paths through {sum(s is not None for s in surfaces)} baked bodies lead to {right / max(total, 1):.0%}"
+    baked = sum(surface is not None for surface in surfaces)
+    said = f"paths through {baked} of {len(surfaces)} bodies, baked from G-buffers, lead to {right / max(total, 1):.0%}"
     if right < 0.5 * total:
         return None, f"{said} of the landing points (50 % are asked for); a network learns the paths instead"
     return tracer, f"{said} of the landing points"
