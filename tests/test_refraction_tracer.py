@@ -12,7 +12,7 @@ from catacaustics.errors import UserError
 from catacaustics.geometry import normalize
 from catacaustics.refraction import meshes
 from catacaustics.refraction import train as training
-from catacaustics.refraction.bodies import Cloud, Sight, Surface, bake_bodies, bake_body, make_sight
+from catacaustics.refraction.bodies import Cloud, Sight, Surface, bake_bodies, bake_body, joined, make_sight
 from catacaustics.refraction.buffers import frame_buffers, frame_screen
 from catacaustics.refraction.evaluate import render_frame
 from catacaustics.refraction.follow import (
@@ -56,8 +56,7 @@ def seen_from(mesh: Mesh, eye: np.ndarray, side: int = 160) -> tuple[Cloud, Sigh
 
 def baked(made: meshes.Mesh) -> Surface:
     clouds, sights = zip(*(seen_from(mesh_of(made), eye) for eye in EYES), strict=True)
-    seen = Cloud(*(np.concatenate(values) for values in zip(*clouds, strict=True)))
-    surface = bake_body(seen, sights)
+    surface = bake_body(joined(clouds), sights)
     assert surface is not None
     return surface
 

@@ -46,9 +46,6 @@ class Cloud(NamedTuple):
     points: Float[np.ndarray, "n 3"]
     normals: Float[np.ndarray, "n 3"]
 
-    def __add__(self, other: "Cloud") -> "Cloud":  # pyright: ignore[reportIncompatibleMethodOverride]
-        return Cloud(*(np.concatenate(parts) for parts in zip(self, other, strict=True)))
-
     def at(self, index: np.ndarray) -> "Cloud":
         return Cloud(self.points[index], self.normals[index])
 
@@ -89,7 +86,7 @@ def bake_bodies(frames: Sequence[Frame]) -> list[Surface | None]:
                 clouds[body].append(_seen(frame, body))
                 if witness:
                     sights[body].append(_sight(frame, body))
-    return [bake_body(_joined(parts), views) if parts else None for parts, views in zip(clouds, sights, strict=True)]
+    return [bake_body(joined(parts), views) if parts else None for parts, views in zip(clouds, sights, strict=True)]
 
 
 def bake_body(seen: Cloud, sights: Sequence[Sight]) -> Surface | None:
@@ -133,7 +130,7 @@ def make_sight(
     return Sight(to_clip, maximum_filter(mask, 3), minimum_filter(np.where(mask, depth, np.inf), 3))
 
 
-def _joined(parts: Sequence[Cloud]) -> Cloud:
+def joined(parts: Sequence[Cloud]) -> Cloud:
     return Cloud(*(np.concatenate(values) for values in zip(*parts, strict=True)))
 
 
@@ -184,7 +181,7 @@ def mirrored(seen: Cloud, cell: float, sights: Sequence[Sight]) -> Cloud:
     for axis in range(3):
         flip = np.where(np.arange(3) == axis, -1.0, 1.0)
         new = _additions(known, Cloud(known.points * flip, known.normals * flip), cell, sights)
-        known = known if new is None else known + new
+        known = known if new is None else joined([known, new])
     return known
 
 
@@ -203,7 +200,7 @@ def with_sphere(known: Cloud, cell: float, sights: Sequence[Sight]) -> Cloud:
     more = Cloud(points, normals).at(within)
     outside = np.linalg.norm(known.points - center, axis=-1) > radius + tolerance
     new = _additions(known, more, cell, sights) if len(more.points) and outside.mean() < _REFUTED else None
-    return known if new is None else known + new
+    return known if new is None else joined([known, new])
 
 
 def _find_sphere(cloud: Cloud, extent: float) -> tuple[np.ndarray, float] | None:
