@@ -230,7 +230,8 @@ def _page(config: RefractReportConfig, result: dict[str, Any]) -> str:
     name = escape(f"{frames.card['scene']}: refraction models compared")
     facts = (
         f"{config.minutes:g} min of {config.clock} time each; {config.generator_share:.0%} of it goes to the "
-        f"generator, glassnet gives it all to its renderer. Landing points are {config.coordinates}. "
+        f"generator; glassnet gives it all to its renderer, hybrid what its generator does not need. Landing "
+        f"points are {config.coordinates}. "
         f"{_seeds(config)}."
     )
     header = f'<header><p class="facts">Refraction baking</p><h1>{name}</h1><p class="hint">{facts}</p></header>'

@@ -87,7 +87,7 @@ def train(config: RefractTrainConfig) -> RefractionModel:
             that is not finite.
         KeyboardInterrupt: after the checkpoint was saved.
     """
-    kind, run = kind_of(config.model), Path(config.run)
+    run = Path(config.run)
     frames = open_frames(config.data)
     _check(config, frames)
     write_json(run / "config.json", {k: str(v) if isinstance(v, Path) else v for k, v in asdict(config).items()})
@@ -98,31 +98,45 @@ def train(config: RefractTrainConfig) -> RefractionModel:
     train_frames, more = frames.split("train"), frames.split("generator")
     cache = BufferCache([train_frames, more], config.cache_gb * 2**30)
     cache.fill()
-    share = config.generator_share if kind else 0.0
-    short = computes_bfloat16(model.device) if config.precision == "auto" else config.precision == "bfloat16"
     if model.generator is not None and config.part != "renderer" and config.generator is None:
-        every = range(len(train_frames) + len(more))
-        minutes = config.minutes and config.minutes * share
-        spent = _bake(model, cache, config)
-        if minutes and isinstance(model.generator, Tracer):
-            minutes = spent / 60 + _REACH_SHARE * minutes
-        sizes, step = (config.batch_generator, config.crop_generator), _generator_step(model, config)
-        part = _Part("generator", every, config.lr_generator, *sizes, minutes, step, short, spent)
-        _fit(model.generator, part, cache, model, config)
+        _train_generator(model, cache, config)
     if config.part != "generator":
-        if model.generator is not None:
-            model.take_generator(config.generator or run / "generator.safetensors")
-            if config.generator is not None:
-                write_bytes(run / "generator.safetensors", config.generator.read_bytes())
-        minutes = config.minutes and config.minutes * (1 - share)
-        if minutes and config.minutes and isinstance(model.generator, Tracer):
-            seconds = load_part(config.generator or run / "generator.safetensors")[2]["seconds"]
-            minutes = max(minutes, config.minutes - seconds / 60)
-        every = range(len(train_frames))
-        step = _renderer_step(model, _baked(model, cache, every, config), config)
-        part = _Part("renderer", every, config.lr_renderer, config.batch, config.crop, minutes, step, short)
-        _fit(model.renderer, part, cache, model, config)
+        _train_renderer(model, cache, config)
     return model.eval()
+
+
+def _train_generator(model: RefractionModel, cache: BufferCache, config: RefractTrainConfig) -> None:
+    """Bake hybrid's bodies; learn what there is to learn."""
+    spent = _bake(model, cache, config)
+    minutes = config.minutes and config.minutes * config.generator_share
+    if minutes and isinstance(model.generator, Tracer):
+        minutes = spent / 60 + _REACH_SHARE * minutes
+    every = range(sum(map(len, cache.splits)))
+    sizes, step = (config.batch_generator, config.crop_generator), _generator_step(model, config)
+    part = _Part("generator", every, config.lr_generator, *sizes, minutes, step, _short(model, config), spent)
+    _fit(model.generator, part, cache, model, config)
+
+
+def _train_renderer(model: RefractionModel, cache: BufferCache, config: RefractTrainConfig) -> None:
+    """With the generator frozen; the time that a tracer did not need is the renderer's."""
+    run = Path(config.run)
+    path = config.generator or run / "generator.safetensors"
+    minutes = config.minutes and config.minutes * (1 - config.generator_share * (model.kind is not None))
+    if model.generator is not None:
+        model.take_generator(path)
+        if config.generator is not None:
+            write_bytes(run / "generator.safetensors", path.read_bytes())
+        if minutes and config.minutes and isinstance(model.generator, Tracer):
+            minutes = max(minutes, config.minutes - load_part(path)[2]["seconds"] / 60)
+    every = range(len(cache.splits[0]))
+    step = _renderer_step(model, _baked(model, cache, every, config), config)
+    part = _Part("renderer", every, config.lr_renderer, config.batch, config.crop, minutes, step, _short(model, config))
+    _fit(model.renderer, part, cache, model, config)
+
+
+def _short(model: RefractionModel, config: RefractTrainConfig) -> bool:
+    """Whether convolutions compute with bfloat16."""
+    return computes_bfloat16(model.device) if config.precision == "auto" else config.precision == "bfloat16"
 
 
 def computes_bfloat16(device: torch.device) -> bool:
@@ -134,13 +148,13 @@ def computes_bfloat16(device: torch.device) -> bool:
 
 
 def _check(config: RefractTrainConfig, frames: Frames) -> None:
-    run = Path(config.run)
+    kind, run = kind_of(config.model), Path(config.run)
     side = int(frames.card["resolution"])
     for crop in (config.crop, config.crop_generator):
         check_layout(Layout.of(frames), config.size, frames, min(crop, side) or side)
     if not len(frames.split("train")):
         raise UserError(f"{config.data} has no training frames.", "one or more", "make them: --train of refract data")
-    if config.part == "generator" and (kind_of(config.model) is None or config.coordinates == "true"):
+    if config.part == "generator" and (kind is None or config.coordinates == "true"):
         found = config.model + " with true coordinates" * (config.coordinates == "true")
         raise UserError(f"{found} has no generator.", "another model or part", "leave --part out")
     parts = ("generator", "renderer") if config.part == "both" else (config.part,)
@@ -153,7 +167,10 @@ def _check(config: RefractTrainConfig, frames: Frames) -> None:
 
 def _bake(model: RefractionModel, cache: BufferCache, config: RefractTrainConfig) -> float:
     """Give hybrid a tracer, where its bodies can be baked; the seconds that it took."""
-    if model.kind != "hybrid" or (Path(config.run) / "generator.safetensors").exists():
+    finished = Path(config.run) / "generator.safetensors"
+    if finished.exists():
+        model.take_generator(finished)
+    if finished.exists() or model.kind != "hybrid":
         return 0.0
     frames = [_without_screen(cache.frame(index)) for index in spread(sum(map(len, cache.splits)))]
     clock = clock_of(config.clock)
