@@ -481,7 +481,7 @@ class RefractTrainConfig:
     """Folder to write: generator and renderer, checkpoints, metrics.jsonl."""
     model: RefractModel = "hybrid"
     """glassnet has no R-buffer, crystalnet looks colours up by texture coordinates, ssnrb on the screen by world
-    coordinates, direct by screen coordinates (ablation), hybrid by world coordinates on the screen or by a probe."""
+    coordinates, direct by screen coordinates (ablation), hybrid by paths through baked bodies, there or by a probe."""
     part: Literal["both", "generator", "renderer"] = "both"
     """Train only one; the renderer needs a trained generator in the run or in --generator."""
     generator: Path | None = None
@@ -494,7 +494,7 @@ class RefractTrainConfig:
     """Stop after this much training time of both parts together; schedules then follow time instead of steps. Reading
     frames ahead and baking R-buffers for the renderer, once, do not count."""
     generator_share: float = 0.5
-    """Of the minutes; a model without generator gives them all to its renderer."""
+    """Of the minutes; glassnet gives them all to its renderer, hybrid what its generator does not need."""
     steps: int = 20_000
     """Optimiser steps of each part, at most."""
     clock: Literal["wall", "cpu"] = "wall"
@@ -569,7 +569,7 @@ class RefractReportConfig:
     minutes: float = 20.0
     """Training time of each model, generator and renderer together."""
     generator_share: float = 0.5
-    """Of the minutes; a model without generator gives them all to its renderer."""
+    """Of the minutes; glassnet gives them all to its renderer, hybrid what its generator does not need."""
     coordinates: Literal["predicted", "true"] = "predicted"
     """true: renderers get true landing points, for their share of the minutes: the best that lookups can give."""
     clock: Literal["wall", "cpu"] = "wall"

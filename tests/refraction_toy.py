@@ -1,7 +1,7 @@
 """A room with glass balls in closed form: frames of refraction baking on the spot, without a path tracer.
 
 The room is the cube [-0.9, 0.9]^3, open towards the camera; each wall has a texture. A ball bends a ray once, at its
-front, and mirrors it near its rim, which stands for total internal reflection.
+front, and mirrors it near its rim, which stands for total internal reflection; or twice, as glass does.
 """
 
 from pathlib import Path
@@ -60,6 +60,14 @@ def refract(directions, normals, eta):
     return eta * directions + (eta * cosine - np.sqrt(np.maximum(1 - sine2, 0))) * normals
 
 
+def through_ball(directions, points, normals, ior, radius):
+    """Where rays that enter a ball at `points` leave it, and which way."""
+    inside = refract(directions, normals, 1 / ior)
+    chord = -2 * radius * (inside * normals).sum(-1, keepdims=True)
+    back = normals + chord / radius * inside
+    return points + chord * inside, refract(inside, -back, ior)
+
+
 def texture_color(textures, wall, uv):
     """Bilinear, repeating, sRGB in [0, 1]; black where the wall is -1."""
     color = np.zeros((*wall.shape, 3), np.float32)
@@ -99,8 +107,9 @@ def toy_probe(center, rows, textures):
     return (texture_color(textures, wall, uv) * 255).round().astype(np.uint8)
 
 
-def toy_frame(rng, side=32, screen=64, balls=2, reference=True, textures=None, placed=None):
-    """A frame with balls at random places, or at those of `placed` (n, 3)."""
+def toy_frame(rng, side=32, screen=64, balls=2, reference=True, textures=None, placed=None, twice=False):
+    """A frame with balls at random places, or at those of `placed` (n, 3); `twice`: they bend rays as glass does, but
+    no ray passes through two of them."""
     textures = textures or toy_textures()
     eye = np.array([rng.uniform(-0.1, 0.1), rng.uniform(-0.1, 0.1), 2.4])
     light = rng.uniform(-0.5, 0.5, 3)
@@ -133,6 +142,8 @@ def toy_frame(rng, side=32, screen=64, balls=2, reference=True, textures=None, p
         through = np.where(
             rim[..., None], rays - 2 * (rays * n).sum(-1, keepdims=True) * n, refract(rays, n, 1 / iors[i])
         )
+        if twice:
+            rim, (point, through) = np.zeros_like(rim), through_ball(rays, point, n, iors[i], 0.35)
         bent, start = np.where(front[..., None], through, bent), np.where(front[..., None], point, start)
         mirrored = np.where(front, rim, mirrored)
     refractive = np.isfinite(first)
@@ -178,7 +189,7 @@ def toy_frame(rng, side=32, screen=64, balls=2, reference=True, textures=None, p
     )
 
 
-def make_toy_frames(folder, side=32, screen=64, seed=0, balls=2, textures=None, **counts):
+def make_toy_frames(folder, side=32, screen=64, seed=0, balls=2, textures=None, twice=False, **counts):
     """A data set of one shard a split on disk, as `catacaustics refract data` writes it."""
     rng = np.random.default_rng(seed)
     textures = textures or toy_textures()
@@ -186,7 +197,7 @@ def make_toy_frames(folder, side=32, screen=64, seed=0, balls=2, textures=None, 
     shards = []
     for split, count in counts.items():
         reference = split != "generator"
-        frames = [toy_frame(rng, side, screen, balls, reference, textures) for _ in range(count)]
+        frames = [toy_frame(rng, side, screen, balls, reference, textures, twice=twice) for _ in range(count)]
         file = f"shards/{split}_0000.npz"
         shards.append(
             {"file": file, "split": split, "frames": count, "sha256": write_shard(Path(folder) / file, frames)}

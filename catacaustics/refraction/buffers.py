@@ -36,6 +36,8 @@ class Buffers(NamedTuple):
     poses: Float[Tensor, "b k 17"]
     """How each object stands, zero where it is nowhere seen in the whole image: rotation body to world (9, by rows),
     place (3), size, index of refraction, mean normal of its seen part (3)."""
+    bodies: Int[Tensor, "b k"]
+    """Which of the scene's transparent bodies each object is, in the order of `Frame.object_mask`; -1 for none."""
     world_to_clip: Float[Tensor, "b 4 4"]
 
     @property
@@ -47,7 +49,7 @@ class Buffers(NamedTuple):
     def crop(self, y: int, x: int, side: int) -> "Buffers":
         """A square part of the images."""
         window = (..., slice(y, y + side), slice(x, x + side))
-        return Buffers._make([*(value[window] for value in self[:-2]), *self[-2:]])
+        return Buffers._make([*(value[window] for value in self[:-3]), *self[-3:]])
 
     def to(self, device: torch.device | str) -> "Buffers":
         return Buffers(*(value.to(device) for value in self))
@@ -82,6 +84,7 @@ def frame_buffers(frame: Frame) -> Buffers:
         landing_normal=image(frame.landing_normal),
         landing_object=torch.from_numpy(frame.landing_object.astype(np.int64))[None],
         poses=torch.from_numpy(_poses(frame, objects))[None],
+        bodies=torch.arange(len(objects))[None] if len(frame.object_mask) else torch.full((1, 1), -1),
         world_to_clip=torch.from_numpy(frame.world_to_clip)[None],
     )
 
@@ -123,7 +126,11 @@ def stack(parts: Sequence[Buffers]) -> Buffers:
     most = max(part.objects.shape[1] for part in parts)
     more = [most - part.objects.shape[1] for part in parts]
     parts = [
-        p._replace(objects=pad(p.objects, (0, 0) * 3 + (0, n)), poses=pad(p.poses, (0, 0, 0, n)))
+        p._replace(
+            objects=pad(p.objects, (0, 0) * 3 + (0, n)),
+            poses=pad(p.poses, (0, 0, 0, n)),
+            bodies=pad(p.bodies, (0, n), value=-1),
+        )
         for p, n in zip(parts, more, strict=True)
     ]
     return Buffers(*(torch.cat(values) for values in zip(*parts, strict=True)))

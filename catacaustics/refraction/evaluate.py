@@ -23,7 +23,7 @@ from catacaustics.refraction.buffers import Buffers, frame_buffers, frame_screen
 from catacaustics.refraction.frames import Frame, Frames, open_frames
 from catacaustics.refraction.lookup import Screen
 from catacaustics.refraction.measures import MEASURES, mean_rows, measure_frame, pool_regions
-from catacaustics.refraction.models import RefractionModel, landing_color, load_model
+from catacaustics.refraction.models import RefractionModel, load_model
 from catacaustics.refraction.train import keep_content
 from catacaustics.report import (
     Picture,
@@ -104,11 +104,7 @@ def render_frame(model: RefractionModel, frame: Frame, content: str = "both") ->
     with torch.no_grad():
         baked = model.bake(buffers, screen)
         image = model.renderer(buffers, keep_content(baked, content)).clamp(0, 1)
-        looked_up = None
-        prediction = model.predict(buffers)
-        if prediction is not None and model.kind is not None:
-            looked_up = landing_color(model.kind, prediction, buffers, screen, model.textures)
-            looked_up = _picture_of(looked_up * buffers.covered)
+        looked_up = _picture_of(baked[:, :3]) if model.kind else None
         true_color = model.textures.sample(buffers.landing_object, buffers.landing_uv)
     return View(_picture_of(image), looked_up, _picture_of(true_color))
 

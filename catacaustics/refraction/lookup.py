@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import grid_sample
 
-from catacaustics.shapes import Bool, Float, Int, UInt8
+from catacaustics.shapes import Float, Int, UInt8
 
 _NOWHERE = 1e4
 """ndc of points at or behind the camera's plane: far outside of any image."""
@@ -65,39 +65,6 @@ def visibility(
     units), 0 beyond twice of it, linear between. Off the screen the value means nothing."""
     difference = (sample_screen(screen_depth, ndc) - depth).abs()
     return (2 - difference / tolerance).clamp(0, 1)
-
-
-def meet_screen(
-    screen_depth: Float[Tensor, "b 1 s s"],
-    world_to_clip: Float[Tensor, "b 4 4"],
-    start: Float[Tensor, "b 3 h w"],
-    points: Float[Tensor, "b 3 h w"],
-    shares: Sequence[float],
-    tolerance: float,
-) -> tuple[Float[Tensor, "b 3 h w"], Bool[Tensor, "b 1 h w"]]:
-    """Where lines from `start` through `points` meet what the camera sees, nearest to `points`, and whether they do.
-
-    Args:
-        shares: places on the lines that are looked at, 0 at `start`, 1 at `points`, rising; between them depth is
-            taken as linear.
-        tolerance: between neighbours that differ by more than this from the screen's depths (scene units) there is an
-            edge of a thing, not its surface.
-    """
-    way = points - start
-    nearest = torch.full_like(way[:, :1], torch.inf)
-    before, share_before = None, 0.0
-    for share in shares:
-        ndc, depth = project(start + share * way, world_to_clip)
-        gap = torch.where(inside_screen(ndc) > 0, depth - sample_screen(screen_depth, ndc), torch.nan)
-        if before is not None:
-            crosses = (before * gap <= 0) & (before.abs() < tolerance) & (gap.abs() < tolerance)
-            part = before / torch.where(before == gap, 1.0, before - gap)
-            found = share_before + part * (share - share_before)
-            better = crosses & ((found - 1).abs() < (nearest - 1).abs())
-            nearest = torch.where(better, found, nearest)
-        before, share_before = gap, share
-    met = nearest.isfinite()
-    return start + torch.where(met, nearest, 1.0) * way, met
 
 
 class Textures:

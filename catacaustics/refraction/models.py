@@ -8,18 +8,18 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 import torch
 from torch import Tensor, nn
-from torch.nn.functional import adaptive_avg_pool2d, cross_entropy, normalize, one_hot
+from torch.nn.functional import avg_pool2d, cross_entropy, interpolate, normalize, one_hot
 
 from catacaustics.errors import UserError
 from catacaustics.files import read_tensors, write_tensors
 from catacaustics.losses import total_variation
 from catacaustics.refraction.buffers import Buffers
+from catacaustics.refraction.follow import Tracer, tracer_like
 from catacaustics.refraction.frames import Frames
 from catacaustics.refraction.lookup import (
     Screen,
     Textures,
     inside_screen,
-    meet_screen,
     project,
     sample_probe,
     sample_screen,
@@ -28,11 +28,11 @@ from catacaustics.refraction.lookup import (
 from catacaustics.refraction.networks import SIZES, Generator, Renderer
 from catacaustics.shapes import Bool, Float, Int, UInt8
 
-FORMAT = 2
+FORMAT = 3
 Kind = Literal["uv", "world", "screen", "hybrid"]
 """What a generator predicts and where its colours are looked up: texture coordinates of every opaque object and which
 object it is (CrystalNet); world coordinates, on the screen (SSNRB); screen coordinates (SSNRB's ablation); world
-coordinates, on the screen and by a probe (ours)."""
+coordinates by tracing paths through baked bodies, on the screen and by a probe (ours)."""
 
 MODELS: dict[str, Kind | None] = {
     "glassnet": None,
@@ -43,15 +43,20 @@ MODELS: dict[str, Kind | None] = {
 }
 """Renderers, and the kind of their R-buffer."""
 
-BLURRED_ROWS = (64, 16)
-"""hybrid: rows of the panorama made smaller, cells of 2.8 and 11 degrees: how blurred the further colours are."""
 _FAR_NDC = 2.0
 """Screen coordinates are learned up to here; what lands farther outside the image counts as landing there."""
 EDGE, TOLERANCE = 0.02, 0.1
 """hybrid: softness at the image's border (ndc) and of the occlusion test (scene units)."""
-MARCH = tuple(0.6 + 0.05 * i for i in range(21))
-"""hybrid: where the line from the first surface is compared with the screen's depth, 1 at the predicted landing point.
-R.L1 where landing points are seen: 0.160 without, 0.154 with it (`checker`, validation frames, one seed)."""
+
+
+class Traced(NamedTuple):
+    """What a tracer knows beside the place where a path lands: the share of light on the path, whether the screen shows
+    that place, where the reflection off the first surface lands, and the share of light on that."""
+
+    light: Float[Tensor, "b 1 h w"]
+    seen: Float[Tensor, "b 1 h w"]
+    mirrored: Float[Tensor, "b 3 h w"]
+    mirrored_light: Float[Tensor, "b 1 h w"]
 
 
 class Prediction(NamedTuple):
@@ -62,6 +67,7 @@ class Prediction(NamedTuple):
     ndc: Float[Tensor, "b 2 h w"] | None
     uv: Float[Tensor, "b t 2 h w"] | None
     logits: Float[Tensor, "b t h w"] | None
+    traced: Traced | None = None
 
 
 class LossWeights(NamedTuple):
@@ -89,20 +95,14 @@ def kind_of(model: str) -> Kind | None:
     return MODELS[model]
 
 
-def same_generator(first: str, second: str) -> bool:
-    """Whether the generators of two models are the same network and learn the same, as those of ssnrb and hybrid."""
-    kinds = {kind_of(first), kind_of(second)}
-    return len(kinds) == 1 or kinds == {"world", "hybrid"}
-
-
 def output_channels(kind: Kind, textures: int) -> int:
     """Channels of a generator for a scene with so many textures."""
     return 6 + {"uv": 3 * textures, "screen": 2}.get(kind, 0)
 
 
 def r_channels(kind: Kind | None) -> int:
-    """Of an R-buffer: colour and normal at the landing point; hybrid's has more colours, blurred."""
-    return {None: 0, "hybrid": 6 + 3 * len(BLURRED_ROWS)}.get(kind, 6)
+    """Of an R-buffer: colour and normal at the landing point; hybrid's goes on (`_further_channels`)."""
+    return {None: 0, "hybrid": 19}.get(kind, 6)
 
 
 def split_output(kind: Kind, output: Float[Tensor, "b c h w"]) -> Prediction:
@@ -113,6 +113,8 @@ def split_output(kind: Kind, output: Float[Tensor, "b c h w"]) -> Prediction:
         return Prediction(normal, world, None, rest[:, : 2 * t].unflatten(1, (t, 2)), rest[:, 2 * t :])
     if kind == "screen":
         return Prediction(normal, world, rest, None, None)
+    if kind == "hybrid" and rest.shape[1]:
+        return Prediction(normal, world, None, None, None, Traced(*rest.split([1, 1, 3, 1], 1)))
     return Prediction(normal, world, None, None, None)
 
 
@@ -191,9 +193,8 @@ def landing_color(
     """Colour (albedo, sRGB-encoded) at the predicted landing points.
 
     uv: bilinear in the texture of the most probable object. world: p_ndc = (P V p)_xyz / (P V p)_w, bilinear in the
-    screen-space colour buffer, clamped to its border. hybrid: moved onto what the
-    screen shows (MARCH), then as world where the point is on the screen and its depth is the screen's, in the probe's
-    panorama elsewhere, with a soft step between.
+    screen-space colour buffer, clamped to its border. hybrid: as world where the screen shows the point, in
+    the probe's panorama elsewhere.
     """
     if prediction.uv is not None and prediction.logits is not None:
         index = prediction.logits.argmax(1)
@@ -201,32 +202,53 @@ def landing_color(
     assert screen is not None, "this kind looks colours up on the screen"
     if prediction.ndc is not None:
         return sample_screen(screen.color, prediction.ndc)
-    ndc, depth = project(prediction.world, buffers.world_to_clip)
-    by_screen = sample_screen(screen.color, ndc)
-    if kind == "world":
-        return by_screen
-    by_probe = sample_probe(screen.probe, screen.probe_position, prediction.world)
-    start = first_surface(buffers)
-    points, met = meet_screen(screen.depth, buffers.world_to_clip, start, prediction.world, MARCH, TOLERANCE)
-    ndc, depth = project(points, buffers.world_to_clip)
-    share = inside_screen(ndc, EDGE) * torch.maximum(met.float(), visibility(screen.depth, ndc, depth, TOLERANCE))
+    if kind == "hybrid":
+        seen = prediction.traced.seen if prediction.traced else None
+        return _color_at(prediction.world, seen, buffers.world_to_clip, screen)
+    ndc, _ = project(prediction.world, buffers.world_to_clip)
+    return sample_screen(screen.color, ndc)
+
+
+def shown_share(screen: Screen, ndc: Tensor, depth: Tensor) -> Float[Tensor, "b 1 h w"]:
+    """1 where the screen shows points, 0 where they are hidden or beside it, with a soft step between."""
+    return inside_screen(ndc, EDGE) * visibility(screen.depth, ndc, depth, TOLERANCE)
+
+
+def _color_at(
+    world: Float[Tensor, "b 3 h w"], seen: Tensor | None, world_to_clip: Tensor, screen: Screen
+) -> Float[Tensor, "b 3 h w"]:
+    """hybrid's lookup: on the screen as far as it shows points (`seen`; None: by its depth), else by the probe."""
+    ndc, depth = project(world, world_to_clip)
+    share = shown_share(screen, ndc, depth) if seen is None else seen
+    by_probe = sample_probe(screen.probe, screen.probe_position, world)
     return share * sample_screen(screen.color, ndc) + (1 - share) * by_probe
 
 
-def blurred_colors(world: Float[Tensor, "b 3 h w"], screen: Screen) -> Float[Tensor, "b c h w"]:
-    """Colours around landing points, by the probe, for every entry of BLURRED_ROWS: where a point is only roughly
-    known, the mean colour around it says more than the colour of one texel."""
-    coarse = [adaptive_avg_pool2d(screen.probe, (rows, 2 * rows)) for rows in BLURRED_ROWS]
-    return torch.cat([sample_probe(probe, screen.probe_position, world) for probe in coarse], 1)
+def _further_channels(prediction: Prediction, buffers: Buffers, screen: Screen) -> Float[Tensor, "b 13 h w"]:
+    """What hybrid's renderer gets beside colour and normal.
+
+    The mean colour of four points in each pixel, between whose centres landing points are interpolated; direct lighting
+    of the landing point where the screen shows it; the point; and where a tracer was at work, the share of light on the
+    path, and the colour that the first surface mirrors times its share.
+    """
+    clip, traced = buffers.world_to_clip, prediction.traced
+    ndc, depth = project(prediction.world, clip)
+    seen = traced.seen if traced else shown_share(screen, ndc, depth)
+    finer = interpolate(torch.cat([prediction.world, seen], 1), scale_factor=2, mode="bilinear", align_corners=False)
+    mean = avg_pool2d(_color_at(finer[:, :3], finer[:, 3:], clip, screen), 2)
+    light, mirrored = torch.zeros_like(seen), torch.zeros_like(mean)
+    if traced:
+        light, mirrored = traced.light, traced.mirrored_light * _color_at(traced.mirrored, None, clip, screen)
+    return torch.cat([mean, seen * sample_screen(buffers.direct, ndc), prediction.world, light, mirrored], 1)
 
 
 def r_buffer(
     kind: Kind, prediction: Prediction, buffers: Buffers, screen: Screen | None, textures: Textures
 ) -> Float[Tensor, "b r h w"]:
-    """Colour and normal at the landing points, then hybrid's blurred colours; zero where there is no glass."""
+    """Colour and normal at the landing points, then hybrid's further channels; zero where there is no glass."""
     parts = [landing_color(kind, prediction, buffers, screen, textures), prediction.normal]
     if kind == "hybrid" and screen is not None:
-        parts.append(blurred_colors(prediction.world, screen))
+        parts.append(_further_channels(prediction, buffers, screen))
     return torch.cat(parts, 1) * buffers.covered
 
 
@@ -305,12 +327,33 @@ class RefractionModel(nn.Module):
         self.kind: Kind | None = kind_of(name)
         self.textures = Textures(textures, device)
         learned = self.kind is not None and coordinates == "predicted"
-        self.generator = new_generator(self.kind, size, len(textures)).to(device) if self.kind and learned else None
+        self.generator: Generator | Tracer | None = None
+        if self.kind and learned:
+            self.generator = new_generator(self.kind, size, len(textures)).to(device)
         self.renderer = new_renderer(self.kind, size).to(device)
 
     @property
     def device(self) -> torch.device:
         return self.textures.texels.device
+
+    def take_generator(self, path: Path) -> None:
+        """Load a trained generator and freeze it; hybrid's may be a tracer or a network.
+
+        Raises:
+            UserError: it is missing, damaged, of another kind or of another layout.
+        """
+        weights, _, header = load_part(path)
+        if header["layout"] != self.layout or header["model"] != self.name:
+            raise UserError(
+                f"{path} is the generator of {header['model']} for the scene {header['layout'].scene!r}.",
+                f"that of {self.name} for the scene {self.layout.scene!r} with the same textures",
+                "take another generator, or train one: leave --generator out",
+            )
+        if self.kind == "hybrid":
+            self.generator = tracer_like(weights, SIZES[header["size"]]) or self.generator
+        assert self.generator is not None
+        fill(self.generator.to(self.device), weights, path)
+        self.generator.requires_grad_(False).eval()
 
     def predict(self, buffers: Buffers) -> Prediction | None:
         """The generator's output, or the truth; None for glassnet."""
@@ -396,8 +439,7 @@ def load_model(run: Path, frames: Frames, device: torch.device | str = "cpu") ->
     )
     fill(model.renderer, weights, run / "renderer.safetensors")
     if model.generator is not None:
-        weights, _, _ = load_part(run / "generator.safetensors")
-        fill(model.generator, weights, run / "generator.safetensors")
+        model.take_generator(run / "generator.safetensors")
     return model.eval()
 
 

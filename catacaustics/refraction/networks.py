@@ -58,7 +58,7 @@ def _biased(conv: nn.Conv2d, bias: list[float]) -> nn.Conv2d:
     return conv
 
 
-def _precise(layer: nn.Module, x: Tensor) -> Tensor:
+def precise(layer: nn.Module, x: Tensor) -> Tensor:
     """A layer in float32, also where others compute with less: its result is coordinates or colours."""
     with torch.autocast(x.device.type, enabled=False):
         return layer(x.float())
@@ -115,7 +115,7 @@ def back_guesses(
     return ball, normal - 2 * (normal * mean_normal).sum(-1, keepdim=True) * mean_normal
 
 
-_TURNS = 2
+TURNS = 2
 """Octaves of directions, and of how a ray passes a body's centre."""
 _SEGMENTS = 3
 """Of a path in the nearest body: all but the last may end in a reflection."""
@@ -140,7 +140,7 @@ class Views(NamedTuple):
 
 
 def _view_channels(size: Size) -> int:
-    return 4 + 2 * 3 * (1 + 2 * size.octaves) + 3 * 3 * (1 + 2 * _TURNS) + 3 * 3
+    return 4 + 2 * 3 * (1 + 2 * size.octaves) + 3 * 3 * (1 + 2 * TURNS) + 3 * 3
 
 
 def object_views(buffers: Buffers, octaves: int) -> Views:
@@ -166,7 +166,7 @@ def object_views(buffers: Buffers, octaves: int) -> Views:
     channels = [
         *(mask, depth, ior.expand_as(mask), size.expand_as(mask)),
         *(encode(v, octaves) for v in (position, at)),
-        *(encode(v, _TURNS) for v in (ray, inside, passing)),
+        *(encode(v, TURNS) for v in (ray, inside, passing)),
         *(rays, normal, normal_here),
     ]
     path = torch.cat([at, inside, normal_here, mean_normal], -1)
@@ -182,7 +182,7 @@ class ObjectEncoder(nn.Module):
 
     def __init__(self, size: Size):
         super().__init__()
-        self.layers = _layers(_view_channels(size), 3 * size.width, size.width)
+        self.layers = layers(_view_channels(size), 3 * size.width, size.width)
 
     def forward(self, views: Views) -> Float[Tensor, "b h w c"]:
         x = self.layers(views.features) * views.seen
@@ -220,21 +220,21 @@ class Segment(nn.Module):
     def __init__(self, context: int, size: Size):
         super().__init__()
         self.octaves, inside = size.octaves, 4 * size.width
-        place, turn = 3 * (1 + 2 * size.octaves), 3 * (1 + 2 * _TURNS)
-        self.length = _layers(context + place + turn + 3, inside, inside)
-        self.onwards = _flat(inside, [-1.0, 0.0, 0.0, 0.0, 0.0])
-        self.surface = _layers(context + place + 6, inside, inside)
-        self.normal = _flat(inside, [0.5, 0.5, 0.0, 0.0, 0.0])
+        place, turn = 3 * (1 + 2 * size.octaves), 3 * (1 + 2 * TURNS)
+        self.length = layers(context + place + turn + 3, inside, inside)
+        self.onwards = flat(inside, [-1.0, 0.0, 0.0, 0.0, 0.0])
+        self.surface = layers(context + place + 6, inside, inside)
+        self.normal = flat(inside, [0.5, 0.5, 0.0, 0.0, 0.0])
 
     def forward(self, context: Tensor, path: Tensor, ior: Tensor, within: Tensor) -> tuple[Tensor, Tensor]:
         """The path at its next surface (n 12, as Views.path) and how much of the ray is still in the body (n 1)."""
         at, direction, normal, mean_normal = path.split(3, -1)
-        x = self.length(torch.cat([context, encode(at, self.octaves), encode(direction, _TURNS), normal], -1))
-        length, leaning, more = _precise(self.onwards, x).split([1, 1, 3], -1)
+        x = self.length(torch.cat([context, encode(at, self.octaves), encode(direction, TURNS), normal], -1))
+        length, leaning, more = precise(self.onwards, x).split([1, 1, 3], -1)
         at = at + within * softplus(length) * direction
         ball, sheet = back_guesses(direction, normal, mean_normal)
         x = self.surface(torch.cat([context, encode(at, self.octaves), ball, sheet], -1))
-        shares, correction = _precise(self.normal, x).split([2, 3], -1)
+        shares, correction = precise(self.normal, x).split([2, 3], -1)
         back = normalize(shares[:, :1] * ball + shares[:, 1:] * sheet + correction, dim=-1)
         cosine = (direction * back).sum(-1, keepdim=True)
         leaves = torch.sigmoid(_SHARPNESS * (1 - ior**2 * (1 - cosine**2)) + leaning)
@@ -262,13 +262,13 @@ class Generator(nn.Module):
         self.objects = ObjectEncoder(size)
         self.trunk = UNet(size.width + 3 * (1 + 2 * size.octaves) + 3 + 1 + 3, size)
         inside, place = 4 * size.width, 3 * (1 + 2 * size.octaves)
-        self.context = _layers(2 * size.width + _view_channels(size), inside, 2 * size.width)
+        self.context = layers(2 * size.width + _view_channels(size), inside, 2 * size.width)
         self.segment = Segment(2 * size.width, size)
-        self.reach = _layers(2 * size.width + place + 3 * (1 + 2 * _TURNS) + 1, inside, inside)
-        self.leave = _flat(inside, [0.5, 0.0, 0.0, 0.0])
-        self.last = _flat(inside, [0.0] * 3)
-        self.land = _layers(inside + place, inside, inside) if outputs > 6 else None
-        self.other = _flat(inside, [0.0] * (outputs - 6)) if outputs > 6 else None
+        self.reach = layers(2 * size.width + place + 3 * (1 + 2 * TURNS) + 1, inside, inside)
+        self.leave = flat(inside, [0.5, 0.0, 0.0, 0.0])
+        self.last = flat(inside, [0.0] * 3)
+        self.land = layers(inside + place, inside, inside) if outputs > 6 else None
+        self.other = flat(inside, [0.0] * (outputs - 6)) if outputs > 6 else None
 
     def forward(self, buffers: Buffers) -> Float[Tensor, "b outputs h w"]:
         views = object_views(buffers, self.octaves)
@@ -284,13 +284,13 @@ class Generator(nn.Module):
         rotation = rows.poses[:, :9].unflatten(1, (3, 3))
         start = rows.poses[:, 9:12] + rows.poses[:, 12:13] * (rotation * path[:, None, :3]).sum(-1)
         direction = (rotation * path[:, None, 3:6]).sum(-1)
-        x = self.reach(torch.cat([x, encode(start, self.octaves), encode(direction, _TURNS), within], -1))
-        distance, more = _precise(self.leave, x).split([1, 3], -1)
+        x = self.reach(torch.cat([x, encode(start, self.octaves), encode(direction, TURNS), within], -1))
+        distance, more = precise(self.leave, x).split([1, 3], -1)
         landing = start + softplus(distance) * normalize(direction + more, dim=-1)
-        found = torch.cat([_precise(self.last, x), landing], -1)
+        found = torch.cat([precise(self.last, x), landing], -1)
         if self.land is not None and self.other is not None:
             x = self.land(torch.cat([x, encode(landing, self.octaves)], -1))
-            found = torch.cat([found, _precise(self.other, x)], -1)
+            found = torch.cat([found, precise(self.other, x)], -1)
         whole = found.new_zeros(*rows.covered.shape, self.outputs)
         whole[rows.covered] = found
         return _image(whole)
@@ -305,7 +305,7 @@ class Generator(nn.Module):
         return path, within
 
 
-def _layers(inputs: int, width: int, outputs: int) -> nn.Sequential:
+def layers(inputs: int, width: int, outputs: int) -> nn.Sequential:
     """Two layers that see one pixel at a time."""
     layers = [nn.Linear(inputs, width), nn.Linear(width, outputs)]
     for layer in layers:
@@ -314,7 +314,7 @@ def _layers(inputs: int, width: int, outputs: int) -> nn.Sequential:
     return nn.Sequential(layers[0], nn.ReLU(), layers[1], nn.ReLU())
 
 
-def _flat(inputs: int, bias: list[float]) -> nn.Linear:
+def flat(inputs: int, bias: list[float]) -> nn.Linear:
     """A layer that at the start gives about its bias."""
     layer = nn.Linear(inputs, len(bias))
     layer.weight.data *= 0.1
@@ -348,6 +348,6 @@ class Renderer(nn.Module):
         code = self.reflection(_join(*geometry, buffers.albedo, buffers.direct))
         objects = _image(self.objects(object_views(buffers, self.octaves)))
         through = self.transmission(_join(code, objects, r_buffer))
-        out = _precise(self.last, relu(self.join(_join(code, through, r_buffer))))
+        out = precise(self.last, relu(self.join(_join(code, through, r_buffer))))
         image = out[:, :3] + out[:, 3:6] * buffers.direct
         return image + out[:, 6:9] * r_buffer[:, :3] if self.r_channels else image

@@ -15,6 +15,8 @@ class Event(NamedTuple):
     refracted: Bool[np.ndarray, "n"]
     total: Bool[np.ndarray, "n"]
     """Totally reflected: there is no refracted ray."""
+    share: Float[np.ndarray, "n"]
+    """Of the light, that takes this branch."""
 
 
 def fresnel(
@@ -55,4 +57,5 @@ def dominant_event(
     mirrored = direction + 2 * cosine[:, None] * facing
     bent = direction / ratio[:, None] + (cosine / ratio - beyond)[:, None] * facing
     total = (1 - cosine**2) >= ratio**2
-    return Event(normalize(np.where(refracted[:, None], bent, mirrored)), refracted, total)
+    share = np.where(refracted, 1 - reflectance, reflectance)
+    return Event(normalize(np.where(refracted[:, None], bent, mirrored)), refracted, total, share)

@@ -31,8 +31,7 @@ Key = tuple[str, str]
 
 def report(config: RefractReportConfig) -> dict[str, Any]:
     """Train and measure every model, size and seed that is not finished; writes OUT/comparison.json, OUT/report.html
-    and OUT/table.md, prints the table and returns what the JSON holds. hybrid takes the generator of ssnrb where that
-    is compared before it.
+    and OUT/table.md, prints the table and returns what the JSON holds.
 
     Raises:
         UserError: no data, unknown model, a run of another time or data set in OUT, or a training that failed.
@@ -43,13 +42,10 @@ def report(config: RefractReportConfig) -> dict[str, Any]:
     runs = []
     for seed, size, model in itertools.product(config.seeds, config.sizes, config.models):
         folder = out / "runs" / f"{model}_{size}_{seed}"
-        # The same network: what is compared is the lookup, not the luck of two trainings.
-        shared = out / "runs" / f"ssnrb_{size}_{seed}" / "generator.safetensors"
         settings = RefractTrainConfig(
             data=config.data,
             run=folder,
             model=model,
-            generator=shared if model == "hybrid" and shared.exists() else None,
             size=size,
             seed=seed,
             minutes=config.minutes,
@@ -104,8 +100,7 @@ def _finished(settings: RefractTrainConfig, config: RefractReportConfig) -> dict
     measured = read_json(path)
     steps = {}
     for part in ("generator", "renderer"):
-        run = settings.generator.parent if part == "generator" and settings.generator else folder
-        log = [line for line in (run / "metrics.jsonl").read_text().splitlines() if f'"{part}"' in line]
+        log = [line for line in (folder / "metrics.jsonl").read_text().splitlines() if f'"{part}"' in line]
         steps[part] = len(log) * 10
     return {key: measured[key] for key in ("mean", "regions", "speed")} | {"steps": steps}
 
@@ -235,7 +230,8 @@ def _page(config: RefractReportConfig, result: dict[str, Any]) -> str:
     name = escape(f"{frames.card['scene']}: refraction models compared")
     facts = (
         f"{config.minutes:g} min of {config.clock} time each; {config.generator_share:.0%} of it goes to the "
-        f"generator, glassnet gives it all to its renderer. Landing points are {config.coordinates}. "
+        f"generator; glassnet gives it all to its renderer, hybrid what its generator does not need. Landing "
+        f"points are {config.coordinates}. "
         f"{_seeds(config)}."
     )
     header = f'<header><p class="facts">Refraction baking</p><h1>{name}</h1><p class="hint">{facts}</p></header>'

@@ -44,7 +44,8 @@ class Media(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Landings:
-    """Where paths land. Where they do not, `body` is -1 and the rest zero; `refractive` and `events` are always set."""
+    """Where paths land. Where they do not, `body` is -1 and the rest zero; `refractive`, `events` and `light` (its
+    share that takes the path, by Fresnel) are always set."""
 
     refractive: Bool[np.ndarray, "n"]
     position: Float[np.ndarray, "n 3"]
@@ -53,6 +54,7 @@ class Landings:
     body: Int[np.ndarray, "n"]
     events: Int[np.ndarray, "n"]
     internal: Bool[np.ndarray, "n"]
+    light: Float[np.ndarray, "n"]
 
 
 def land(
@@ -61,15 +63,21 @@ def land(
     origins: Float[np.ndarray, "n 3"],
     directions: Float[np.ndarray, "n 3"],
     max_events: int = MAX_EVENTS,
+    first: Hits | None = None,
 ) -> Landings:
-    """Follow the specular paths of rays (unit directions) whose first surface is transparent."""
+    """Follow the specular paths of rays (unit directions) whose first surface is transparent.
+
+    Args:
+        first: what the rays meet first, where that is known.
+    """
     n = len(origins)
     refractive, internal, body = np.zeros(n, bool), np.zeros(n, bool), np.full(n, -1)
     position, normal, uv, events = np.zeros((n, 3)), np.zeros((n, 3)), np.zeros((n, 2)), np.zeros(n, int)
+    light = np.ones(n)
     active, origin, direction = np.arange(n), np.asarray(origins, float), np.asarray(directions, float)
     opaque = np.isnan(media.inner)
     for count in range(max_events + 1):
-        hits = intersect(origin, direction)
+        hits = first if first is not None and count == 0 else intersect(origin, direction)
         met = hits.body >= 0
         ends = met & opaque[hits.body]
         goes_on = met & ~ends
@@ -88,8 +96,9 @@ def land(
         event = dominant_event(direction[goes_on], hits.shading, media.inner[hits.body], media.outer[hits.body])
         direction = event.direction
         events[active] += 1
+        light[active] *= event.share
         internal[active] |= event.total
         slope = np.abs((direction * hits.normal).sum(-1, keepdims=True))
         origin = point + CLEARANCE / np.maximum(slope, 0.01) * direction
     internal &= body >= 0
-    return Landings(refractive, position, normal, uv, body, events, internal)
+    return Landings(refractive, position, normal, uv, body, events, internal, light)

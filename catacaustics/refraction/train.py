@@ -4,7 +4,7 @@ import json
 import math
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,8 +17,10 @@ from catacaustics.config import RefractTrainConfig
 from catacaustics.errors import UserError
 from catacaustics.files import write_bytes, write_json
 from catacaustics.losses import dssim
+from catacaustics.refraction.bodies import spread
 from catacaustics.refraction.buffers import BufferCache, Buffers, frame_screen, stack
-from catacaustics.refraction.frames import Frames, open_frames
+from catacaustics.refraction.follow import Tracer, bake_tracer
+from catacaustics.refraction.frames import Frame, Frames, open_frames
 from catacaustics.refraction.lookup import Screen
 from catacaustics.refraction.models import (
     Layout,
@@ -30,14 +32,16 @@ from catacaustics.refraction.models import (
     kind_of,
     load_part,
     needs_screen,
-    same_generator,
     save_part,
     split_output,
 )
+from catacaustics.refraction.networks import SIZES
 from catacaustics.run import choose_device, clock_of
 from catacaustics.training.optimizer import optimizer_tensors, restore_optimizer
 
 _LOG_EVERY = 10
+_REACH_SHARE = 0.25
+"""What a tracer learns takes this share of a network's time, after baking; the rest goes to the renderer."""
 _LONGEST_GRADIENT = 1.0
 """Longer gradients are shortened to this; usual ones are a tenth of it."""
 Place = tuple[int, int, int]
@@ -70,6 +74,8 @@ class _Part:
     losses: Callable[[Buffers, list[Place]], dict[str, Tensor]]
     bfloat16: bool
     """Convolutions compute with bfloat16."""
+    spent: float = 0.0
+    """Seconds that were used before the first step."""
 
 
 def train(config: RefractTrainConfig) -> RefractionModel:
@@ -81,7 +87,7 @@ def train(config: RefractTrainConfig) -> RefractionModel:
             that is not finite.
         KeyboardInterrupt: after the checkpoint was saved.
     """
-    kind, run = kind_of(config.model), Path(config.run)
+    run = Path(config.run)
     frames = open_frames(config.data)
     _check(config, frames)
     write_json(run / "config.json", {k: str(v) if isinstance(v, Path) else v for k, v in asdict(config).items()})
@@ -92,25 +98,45 @@ def train(config: RefractTrainConfig) -> RefractionModel:
     train_frames, more = frames.split("train"), frames.split("generator")
     cache = BufferCache([train_frames, more], config.cache_gb * 2**30)
     cache.fill()
-    share = config.generator_share if kind else 0.0
-    short = computes_bfloat16(model.device) if config.precision == "auto" else config.precision == "bfloat16"
     if model.generator is not None and config.part != "renderer" and config.generator is None:
-        every = range(len(train_frames) + len(more))
-        minutes = config.minutes and config.minutes * share
-        sizes, step = (config.batch_generator, config.crop_generator), _generator_step(model, config)
-        part = _Part("generator", every, config.lr_generator, *sizes, minutes, step, short)
-        _fit(model.generator, part, cache, model, config)
+        _train_generator(model, cache, config)
     if config.part != "generator":
-        if model.generator is not None:
-            _take_generator(model, config.generator or run / "generator.safetensors")
-            if config.generator is not None:
-                write_bytes(run / "generator.safetensors", config.generator.read_bytes())
-        minutes = config.minutes and config.minutes * (1 - share)
-        every = range(len(train_frames))
-        step = _renderer_step(model, _baked(model, cache, every, config), config)
-        part = _Part("renderer", every, config.lr_renderer, config.batch, config.crop, minutes, step, short)
-        _fit(model.renderer, part, cache, model, config)
+        _train_renderer(model, cache, config)
     return model.eval()
+
+
+def _train_generator(model: RefractionModel, cache: BufferCache, config: RefractTrainConfig) -> None:
+    """Bake hybrid's bodies; learn what there is to learn."""
+    spent = _bake(model, cache, config)
+    minutes = config.minutes and config.minutes * config.generator_share
+    if minutes and isinstance(model.generator, Tracer):
+        minutes = spent / 60 + _REACH_SHARE * minutes
+    every = range(sum(map(len, cache.splits)))
+    sizes, step = (config.batch_generator, config.crop_generator), _generator_step(model, config)
+    part = _Part("generator", every, config.lr_generator, *sizes, minutes, step, _short(model, config), spent)
+    _fit(model.generator, part, cache, model, config)
+
+
+def _train_renderer(model: RefractionModel, cache: BufferCache, config: RefractTrainConfig) -> None:
+    """With the generator frozen; the time that a tracer did not need is the renderer's."""
+    run = Path(config.run)
+    path = config.generator or run / "generator.safetensors"
+    minutes = config.minutes and config.minutes * (1 - config.generator_share * (model.kind is not None))
+    if model.generator is not None:
+        model.take_generator(path)
+        if config.generator is not None:
+            write_bytes(run / "generator.safetensors", path.read_bytes())
+        if minutes and config.minutes and isinstance(model.generator, Tracer):
+            minutes = max(minutes, config.minutes - load_part(path)[2]["seconds"] / 60)
+    every = range(len(cache.splits[0]))
+    step = _renderer_step(model, _baked(model, cache, every, config), config)
+    part = _Part("renderer", every, config.lr_renderer, config.batch, config.crop, minutes, step, _short(model, config))
+    _fit(model.renderer, part, cache, model, config)
+
+
+def _short(model: RefractionModel, config: RefractTrainConfig) -> bool:
+    """Whether convolutions compute with bfloat16."""
+    return computes_bfloat16(model.device) if config.precision == "auto" else config.precision == "bfloat16"
 
 
 def computes_bfloat16(device: torch.device) -> bool:
@@ -122,13 +148,13 @@ def computes_bfloat16(device: torch.device) -> bool:
 
 
 def _check(config: RefractTrainConfig, frames: Frames) -> None:
-    run = Path(config.run)
+    kind, run = kind_of(config.model), Path(config.run)
     side = int(frames.card["resolution"])
     for crop in (config.crop, config.crop_generator):
         check_layout(Layout.of(frames), config.size, frames, min(crop, side) or side)
     if not len(frames.split("train")):
         raise UserError(f"{config.data} has no training frames.", "one or more", "make them: --train of refract data")
-    if config.part == "generator" and (kind_of(config.model) is None or config.coordinates == "true"):
+    if config.part == "generator" and (kind is None or config.coordinates == "true"):
         found = config.model + " with true coordinates" * (config.coordinates == "true")
         raise UserError(f"{found} has no generator.", "another model or part", "leave --part out")
     parts = ("generator", "renderer") if config.part == "both" else (config.part,)
@@ -139,22 +165,26 @@ def _check(config: RefractTrainConfig, frames: Frames) -> None:
         )
 
 
-def _take_generator(model: RefractionModel, path: Path) -> None:
-    """Load and freeze a trained generator.
+def _bake(model: RefractionModel, cache: BufferCache, config: RefractTrainConfig) -> float:
+    """Give hybrid a tracer, where its bodies can be baked; the seconds that it took."""
+    finished = Path(config.run) / "generator.safetensors"
+    if finished.exists():
+        model.take_generator(finished)
+    if finished.exists() or model.kind != "hybrid":
+        return 0.0
+    frames = [_without_screen(cache.frame(index)) for index in spread(sum(map(len, cache.splits)))]
+    clock = clock_of(config.clock)
+    started = clock()
+    tracer, told = bake_tracer(frames, SIZES[model.size])
+    print(f"training: {told}")
+    if tracer is not None:
+        model.generator = tracer.to(model.device)
+    return clock() - started
 
-    Raises:
-        UserError: it is missing, damaged, of another kind or of another layout.
-    """
-    weights, _, header = load_part(path)
-    if header["layout"] != model.layout or not same_generator(header["model"], model.name):
-        raise UserError(
-            f"{path} is the generator of {header['model']} for the scene {header['layout'].scene!r}.",
-            f"that of {model.name} for the scene {model.layout.scene!r} with the same textures",
-            "take another generator, or train one: leave --generator out",
-        )
-    assert model.generator is not None
-    fill(model.generator, weights, path)
-    model.generator.requires_grad_(False).eval()
+
+def _without_screen(frame: Frame) -> Frame:
+    """Lighter by what bodies do not need."""
+    return replace(frame, screen=frame.screen[:0, :0], screen_depth=frame.screen_depth[:0, :0], probe=frame.probe[:0])
 
 
 # What a step learns ----------------------------------------------------------------------------------------------
@@ -250,7 +280,7 @@ def _fit(
 def _start(network: nn.Module, part: _Part, config: RefractTrainConfig) -> PartState:
     groups = [{"params": [p], "name": name} for name, p in network.named_parameters()]
     optimizer = torch.optim.AdamW(groups, weight_decay=config.weight_decay, fused=True)
-    state = PartState(network, optimizer)
+    state = PartState(network, optimizer, seconds=part.spent)
     path = Path(config.run) / f"{part.name}.checkpoint.safetensors"
     if path.exists():
         weights, extra, header = load_part(path)
