@@ -29,6 +29,7 @@ from catacaustics.reflectors.warps import (
     StaticWarp,
     warp_from_state,
 )
+from catacaustics.training import mirrors
 from catacaustics.training.mirrors import off_body
 
 CENTER = torch.tensor([0.2, -0.1, 0.4])
@@ -261,6 +262,24 @@ def test_a_bent_sheet_is_found_as_a_cylinder_with_its_convex_side(side):
     np.testing.assert_allclose(np.linalg.norm(axes, axis=0)[1:], 0.34, rtol=0.05)
     assert side * axes[0, 2] > 0.32
     assert fit_bent_sheet(tangent_planes(np.zeros(3), 0.3 * np.eye(3))) == []
+
+
+def test_a_bent_sheet_starts_as_a_cylinder_alone_and_a_flat_ellipsoid_does_not():
+    rng = np.random.default_rng(0)
+    angle, z = np.radians(rng.uniform(-47.5, 47.5, 2000)), rng.uniform(-0.2, 0.2, 2000)
+    sheet = np.stack([0.34 * np.cos(angle), 0.34 * np.sin(angle), z], 1)
+    axes = np.diag([0.1, 0.4, 0.5])
+    pebble = normalize(rng.normal(size=(2000, 3))) @ axes
+    for points, volume, starts in (
+        (sheet, hull_volume(sheet), 2),
+        (pebble, tangent_planes(np.zeros(3), axes), 4),
+    ):
+        assert len(fit_bent_sheet(volume)) == 2  # both are flat
+        center, axes = (torch.from_numpy(v).float() for v in fit_ellipsoid(volume))
+        found = mirrors._starts(QuadricWarp(center, axes, sphere=False), volume, points)
+        assert len(found) == starts
+        longest = max(float(axes.norm(dim=0).max()) for _, axes, _ in found)
+        assert (longest > 1.5) == (starts == 2)  # a cylinder is a long ellipsoid
 
 
 def test_surroundings_are_spread_evenly_and_show_the_nearest_known_point():

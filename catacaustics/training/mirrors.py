@@ -44,18 +44,14 @@ def start_shapes(scene: Scene, capture: Capture, config: TrainConfig) -> None:
         for warp, volume in zip(scene.warps, scene.volumes, strict=True):
             mirror = warp.quadric if isinstance(warp, QuadricNeuralWarp) else warp
             if isinstance(mirror, Mirror):
-                bent = _bent(mirror, volume)
                 hollow = isinstance(mirror, QuadricWarp) and bool(mirror.concave)
-                round_body = not (bent or hollow or isinstance(mirror, PlaneWarp))
-                body = (
-                    torch.from_numpy(_hull_points(volume, capture)).to(scene.device, torch.float32)
-                    if round_body
-                    else None
-                )
+                points = None if hollow or isinstance(mirror, PlaneWarp) else _hull_points(volume, capture)
                 boxes = [_middle_box(volume.scaled(0.6), camera) for _, camera in cameras]
                 seen = [(v, c, box) for (v, c), box in zip(cameras, boxes, strict=True) if box is not None]
                 if seen:
-                    _start_shape(scene, capture, mirror, _starts(mirror, volume, body, bent), seen, body)
+                    starts = _starts(mirror, volume, points)
+                    body = None if points is None else torch.from_numpy(points).to(scene.device, torch.float32)
+                    _start_shape(scene, capture, mirror, starts, seen, body)
 
 
 def _start_shape(
@@ -119,6 +115,22 @@ def off_body(points: Float[torch.Tensor, "n 3"], mirror: QuadricWarp | Revolutio
     return body_loss(quadric.distances(points, center, axes) / axes.norm(dim=0).mean())
 
 
+def _nearest_ellipsoid(
+    points: Float[np.ndarray, "n 3"], volume: ReflectionVolume
+) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"], float]:
+    """Centre and half-axes of the ellipsoid in a visual hull, and its loss."""
+    center, axes = fit_body(points, *fit_ellipsoid(volume), sphere=False)
+    shape = (torch.from_numpy(v) for v in (points, center, axes))
+    return center, axes, float(body_loss(quadric.distances(*shape) / np.linalg.norm(axes, axis=0).mean()))
+
+
+def is_turned(volume: ReflectionVolume, capture: Capture) -> bool:
+    """Whether a visual hull is a surface of revolution, and not an ellipsoid."""
+    points = _hull_points(volume, capture)
+    center, axes, loss = _nearest_ellipsoid(points, volume)
+    return loss > _ROUND and fit_revolution(points, center, axes)[1] < _TURNED * loss
+
+
 def impossible_shapes(volume: ReflectionVolume, capture: Capture) -> dict[str, str]:
     """Rungs that the masks of a reflector rule out, and why."""
     if fit_bent_sheet(volume):
@@ -126,41 +138,25 @@ def impossible_shapes(volume: ReflectionVolume, capture: Capture) -> dict[str, s
     return {} if is_turned(volume, capture) else {"revolution": "the masks show an ellipsoid, or no turned shape"}
 
 
-def is_turned(volume: ReflectionVolume, capture: Capture) -> bool:
-    """Whether a visual hull is a surface of revolution, and not an ellipsoid."""
-    points = _hull_points(volume, capture)
-    center, axes = fit_body(points, *fit_ellipsoid(volume), sphere=False)
-    shape = (torch.from_numpy(v) for v in (points, center, axes))
-    loss = float(body_loss(quadric.distances(*shape) / np.linalg.norm(axes, axis=0).mean()))
-    return loss > _ROUND and fit_revolution(points, center, axes)[1] < _TURNED * loss
-
-
-def _bent(mirror: Mirror, volume: ReflectionVolume) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The cylinders of a flat volume, for an ellipsoid."""
-    ellipsoid = isinstance(mirror, QuadricWarp) and len(mirror.log_radii) == 3 and not mirror.concave
-    return fit_bent_sheet(volume) if ellipsoid else []
-
-
 def _starts(
-    mirror: Mirror,
-    volume: ReflectionVolume,
-    body: Float[torch.Tensor, "n 3"] | None,
-    bent: list[tuple[np.ndarray, np.ndarray]],
+    mirror: Mirror, volume: ReflectionVolume, points: Float[np.ndarray, "n 3"] | None
 ) -> list[list[torch.Tensor]]:
-    """Buffers of a mirror to start from: as it is; convex quadrics smaller too and as the body in the visual hull, or
-    as a bent sheet; surfaces of revolution as that body."""
+    """Buffers of a mirror to start from: bowls and planes as they are; convex quadrics in several sizes and as the body
+    in the visual hull, or as cylinders where that is flat and no ellipsoid; surfaces of revolution as that body."""
     start = [b.clone() for b in mirror.buffers()]
-    points = None if body is None else body.cpu().numpy().astype(float)
-    if isinstance(mirror, RevolutionWarp) and points is not None:
-        surface, _ = fit_revolution(points, *fit_body(points, *fit_ellipsoid(volume), sphere=False))
-        return [[value.to(start[0]) for value in surface]]
-    if not isinstance(mirror, QuadricWarp) or mirror.concave:
+    if points is None:
         return [start]
+    if isinstance(mirror, RevolutionWarp):
+        center, axes, _ = _nearest_ellipsoid(points, volume)
+        return [[value.to(start[0]) for value in fit_revolution(points, center, axes)[0]]]
     center, axes, concave = start
-    found, sizes = bent, (1.0,)
-    if points is not None:
+    sphere = isinstance(mirror, QuadricWarp) and len(mirror.log_radii) == 1
+    sheets = [] if sphere else fit_bent_sheet(volume)
+    if sheets and _nearest_ellipsoid(points, volume)[2] > _ROUND:
+        found, sizes = sheets, ()
+    else:
         shape = (t.cpu().numpy().astype(float) for t in (center, axes))
-        found, sizes = [fit_body(points, *shape, sphere=len(mirror.log_radii) == 1)], _SIZES
+        found, sizes = [fit_body(points, *shape, sphere=sphere)], _SIZES
     others = [[torch.from_numpy(c).to(center), torch.from_numpy(a).to(axes), concave] for c, a in found]
     return [[center, size * axes, concave] for size in sizes] + others
 
