@@ -34,13 +34,15 @@ _ROWS: dict[str, dict[str, Any]] = {
     "full (neural)": {"model": ("neural",)},
 }
 _RUNGS = ("static", "plane", "sphere", "ellipsoid", "revolution", "concave", "quadric+neural")
+_LINES = 30
+"""Names that find room above each other in the chart."""
 _CLOUDS = (0.25, 0.5)
 """Sizes of the reflection clouds in the chart beside the usual one, in its units."""
 
 
 def ablate(config: AblateConfig) -> dict[str, Any]:
     """Train every row for the same time and for the same iterations and measure it on the held-out views; finished
-    rows are kept. Writes OUT/ablation.json, OUT/ablation.html; prints the table and returns what the JSON holds.
+    rows are kept. Writes OUT/ablation.json, .html and .svg; prints the table and returns what the JSON holds.
 
     Raises:
         UserError: no capture, no held-out views, no reflector, or a row of that name.
@@ -81,6 +83,7 @@ def ablate(config: AblateConfig) -> dict[str, Any]:
                 results.append({"name": name, "budget": budget, "seed": seed} | result)
                 write_json(path, {"key": key, "results": results})
     write_text(out / "ablation.html", _page(capture, config, results))
+    write_text(out / "ablation.svg", chart(results))
     print(format_rows(results))
     print(f"ablation: {out / 'ablation.html'}")
     if config.json is not None:
@@ -242,6 +245,7 @@ def chart(results: list[dict[str, Any]]) -> str:
     shown = [r for r in results if r["budget"] == budgets[0]] if budgets else []
     figure = Figure(figsize=(9, 5), layout="constrained")
     axes = figure.add_subplot()
+    ends: list[tuple[float, float, str, Any]] = []
     for name in dict.fromkeys(r["name"] for r in shown):
         curves = [r["curve"] for r in shown if r["name"] == name]
         count = min(map(len, curves))
@@ -250,8 +254,11 @@ def chart(results: list[dict[str, Any]]) -> str:
         (line,) = axes.plot(
             x, y, marker="o", markersize=3, linewidth=1 if faint else 2, linestyle="--" if faint else "-"
         )
-        axes.annotate(name, (x[-1], y[-1]), (6, 0), textcoords="offset points", va="center", fontsize=8,
-                      color=line.get_color())  # fmt: skip
+        ends.append((float(y[-1]), float(x[-1]), name, line.get_color()))
+    gap, lowest = np.ptp(axes.get_ylim()) / _LINES, -np.inf
+    for y, x, name, color in sorted(ends):  # names of curves that end close together stand above each other
+        lowest = max(y, lowest + gap)
+        axes.annotate(name, (x, y), (1.01 * x, lowest), va="center", fontsize=8, color=color)
     axes.set_xlabel("training seconds")
     axes.set_ylabel("PSNR inside the reflector, held-out views (dB)")
     axes.margins(x=0.22)

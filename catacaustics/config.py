@@ -163,7 +163,7 @@ class AblateConfig:
     capture: Path
     """Folder made by `catacaustics calibrate`."""
     out: Path
-    """Folder to write: ablation.json, ablation.html; finished rows found there are kept."""
+    """Folder to write: ablation.json, .html and .svg (the chart); finished rows found there are kept."""
     minutes: float | None = 1.0
     """Training time of each row in the comparison at equal time; None leaves it out."""
     clock: Literal["wall", "cpu"] = "wall"

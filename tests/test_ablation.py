@@ -45,6 +45,7 @@ def test_the_table_gives_means_over_seeds_and_the_page_a_chart(finished):
     assert next(r for r in rows if r["name"] == "half warp")["inside"] == pytest.approx(sum(ends) / 2)
     assert "half warp" in format_rows(result["results"])
     page = (root / "out" / "ablation.html").read_text()
+    assert (root / "out" / "ablation.svg").read_text().startswith("<svg")
     assert "<svg" in page
     assert "primary only" in page
 
