@@ -11,6 +11,7 @@ from scipy.ndimage import map_coordinates
 
 from catacaustics.files import write_json
 from catacaustics.images import resize, write_image
+from catacaustics.refraction import train as training
 from catacaustics.refraction.frames import FORMAT, Frame, write_shard
 
 HALF = 0.9
@@ -216,3 +217,17 @@ def make_toy_frames(folder, side=32, screen=64, seed=0, balls=2, textures=None, 
     }
     write_json(Path(folder) / "card.json", card)
     return Path(folder)
+
+
+def interrupt_parts(monkeypatch, stops: dict[str, int]) -> dict[str, int]:
+    """The training of each part named is interrupted, once, before this step of it; returns what has yet to happen."""
+    step, left = training._step, dict(stops)
+
+    def interrupted(state, part, *rest):
+        if state.step == left.get(part.name):
+            del left[part.name]
+            raise KeyboardInterrupt
+        return step(state, part, *rest)
+
+    monkeypatch.setattr(training, "_step", interrupted)
+    return left

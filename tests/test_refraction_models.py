@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from refraction_toy import make_toy_frames, toy_frame, toy_textures
+from refraction_toy import interrupt_parts, make_toy_frames, toy_frame, toy_textures
 
 from catacaustics.config import RefractTrainConfig
 from catacaustics.errors import UserError
@@ -288,15 +288,7 @@ def test_an_interrupted_training_goes_on_to_the_same_weights_bit_for_bit(data, t
     training.train(config)
     cut = replace(config, run=tmp_path / "cut")
     parts = ["generator", "renderer"] if m.MODELS[name] else ["renderer"]
-    step, stops = training._step, {part: 5 for part in parts}
-
-    def interrupted(state, part, *rest):
-        if state.step == stops.get(part.name):
-            del stops[part.name]
-            raise KeyboardInterrupt
-        return step(state, part, *rest)
-
-    monkeypatch.setattr(training, "_step", interrupted)
+    stops = interrupt_parts(monkeypatch, dict.fromkeys(parts, 5))
     for _ in parts:
         with pytest.raises(KeyboardInterrupt):
             training.train(replace(cut, resume=True))

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from refraction_toy import make_toy_frames, toy_frame, view
+from refraction_toy import interrupt_parts, make_toy_frames, toy_frame, view
 
 from catacaustics.config import RefractTrainConfig
 from catacaustics.errors import UserError
@@ -311,15 +311,7 @@ def test_what_baking_and_learning_leave_of_the_minutes_goes_to_the_renderer(data
 def test_an_interrupted_training_of_a_tracer_goes_on_to_the_same_weights(data, tmp_path, monkeypatch):
     config = RefractTrainConfig(data, tmp_path / "whole", steps=8, batch=2, crop=16, checkpoint_minutes=1e-9)
     train(config)
-    step, stops = training._step, {"generator": 5, "renderer": 3}
-
-    def interrupted(state, part, *rest):
-        if state.step == stops.get(part.name):
-            del stops[part.name]
-            raise KeyboardInterrupt
-        return step(state, part, *rest)
-
-    monkeypatch.setattr(training, "_step", interrupted)
+    interrupt_parts(monkeypatch, {"generator": 5, "renderer": 3})
     cut = replace(config, run=tmp_path / "cut", resume=True)
     for _ in range(2):
         with pytest.raises(KeyboardInterrupt):
