@@ -195,6 +195,11 @@ class Scene(nn.Module):
         depth = image[..., FEATURES + 1] / torch.where(alpha > 1e-4, alpha, torch.inf)
         return Layers(primary, reflection, rho, reflection_through, through, depth, directions, splats)
 
+    def openings(self, camera: Camera) -> tuple[Float[Tensor, "height width 3"], Float[Tensor, "height width"]]:
+        """Viewing directions, and how open the primary cloud is along them, whatever is reflected."""
+        viewport = camera.viewport
+        return self._directions(camera, viewport), self._splat_primary(camera, viewport, None).transmittance
+
     def decode(self, layers: Layers) -> Float[Tensor, "height width 3"]:
         """RGB of splatted layers, not clamped: training needs the gradient outside [0, 1] too."""
         return self.renderer(*_weighted(layers), layers.directions)

@@ -5,7 +5,7 @@ import pytest
 
 from catacaustics.cameras import Camera, pixel_centers
 from catacaustics.geometry import look_at
-from catacaustics.reflectors.visual_hull import sample_visual_hull
+from catacaustics.reflectors.visual_hull import carve_visual_hull
 from catacaustics.reflectors.volume import volume_from_masks
 
 CENTERS, RADIUS = np.array([[0, 0, -0.6], [0, 0, 0.6]]), 0.45
@@ -32,7 +32,7 @@ def masks_of(cameras: list[Camera]) -> list[tuple[str, Camera, np.ndarray]]:
 def sampled():
     masks = masks_of([camera_at(a) for a in np.linspace(0, 2 * np.pi, 16, endpoint=False)])
     volume = volume_from_masks("balls", masks)
-    return volume, masks, sample_visual_hull(volume, masks, 4000, np.random.default_rng(0))
+    return volume, masks, carve_visual_hull(volume, masks).sample(4000, np.random.default_rng(0))
 
 
 def test_points_lie_on_two_balls_and_none_in_the_gap_between_them(sampled):
@@ -67,7 +67,7 @@ def test_a_picture_that_shows_a_part_says_nothing_about_the_rest(sampled):
     beside = camera_at(0.3, cx=20.0)  # the balls reach beyond its left border
     assert outline(beside)[:, 0].any()
     masks = [*masks, ("beside", beside, outline(beside))]
-    points, _ = sample_visual_hull(volume, masks, 2000, np.random.default_rng(0))
+    points, _ = carve_visual_hull(volume, masks).sample(2000, np.random.default_rng(0))
     pixels, _ = beside.project(points)
     assert (pixels[:, 0] < 0).mean() > 0.1
 
@@ -76,7 +76,7 @@ def test_where_the_masks_leave_nothing_the_volume_is_taken(sampled):
     volume, masks, _ = sampled
     _, camera, mask = masks[0]
     masks = [*masks, ("empty", camera, np.zeros_like(mask))]
-    points, normals = sample_visual_hull(volume, masks, 500, np.random.default_rng(0))
+    points, normals = carve_visual_hull(volume, masks).sample(500, np.random.default_rng(0))
     expected = volume.sample_surface(500, np.random.default_rng(0))
     np.testing.assert_array_equal(points, expected[0])
     np.testing.assert_array_equal(normals, expected[1])

@@ -276,7 +276,8 @@ def test_a_bent_sheet_starts_as_a_cylinder_alone_and_a_flat_ellipsoid_does_not()
     ):
         assert len(fit_bent_sheet(volume)) == 2  # both are flat
         center, axes = (torch.from_numpy(v).float() for v in fit_ellipsoid(volume))
-        found = mirrors._starts(QuadricWarp(center, axes, sphere=False), volume, points)
+        body = mirrors.nearest_ellipsoid(points, volume)
+        found = mirrors._starts(QuadricWarp(center, axes, sphere=False), volume, body)
         assert len(found) == starts
         longest = max(float(axes.norm(dim=0).max()) for _, axes, _ in found)
         assert (longest > 1.5) == (starts == 2)  # a cylinder is a long ellipsoid

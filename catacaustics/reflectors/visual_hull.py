@@ -5,6 +5,7 @@ itself: a neck, a handle or a spout leaves gaps in the convex volume through whi
 """
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -24,33 +25,46 @@ _LEVEL = 0.25
 """Of the soft masks, where the surface is: a pixel outside their outlines, as hands and calibrations err."""
 
 
-def sample_visual_hull(
-    volume: ReflectionVolume,
-    masks: Sequence[tuple[str, Camera, Bool[np.ndarray, "height width"]]],
-    count: int,
-    rng: np.random.Generator,
-) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
-    """Random points of the visual hull's surface and their outward unit normals.
-
-    A point belongs to the hull where it lies in the volume and no mask that it projects into excludes it. The surface
-    is found where the edges of a grid cross it (the corners of marching cubes, Lorensen and Cline 1987). Where the
-    masks leave nothing (they contradict each other, or the object is thinner than a cell), points of the volume.
+class VisualHull(NamedTuple):
+    """The surface of a visual hull, as points to draw from.
 
     Args:
-        masks: names of views, their cameras, and where they see the reflector.
+        volume: that the hull lies in.
+        points, normals: where the edges of a grid cross the surface, and outward unit normals there; empty where the
+            masks leave nothing (they contradict each other, or the object is thinner than a cell).
+        cell: spacing of the grid.
+    """
+
+    volume: ReflectionVolume
+    points: Float[np.ndarray, "n 3"]
+    normals: Float[np.ndarray, "n 3"]
+    cell: float
+
+    def sample(self, count: int, rng: np.random.Generator) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 3"]]:
+        """`count` random points of the surface and their outward unit normals; of the volume's where it is empty."""
+        if not len(self.points):
+            return self.volume.sample_surface(count, rng)
+        # Edges cross a surface evenly up to their slant: |n_x| + |n_y| + |n_z| crossings an area.
+        density = 1 / np.abs(self.normals).sum(1)
+        chosen = rng.choice(len(self.points), count, p=density / density.sum())
+        points, normals = self.points[chosen], self.normals[chosen]
+        spread = rng.uniform(-0.5, 0.5, (count, 3)) * self.cell
+        spread -= (spread * normals).sum(1, keepdims=True) * normals
+        spread[~self.volume.contains(points + spread)] = 0
+        return points + spread, normals
+
+
+def carve_visual_hull(
+    volume: ReflectionVolume, masks: Sequence[tuple[str, Camera, Bool[np.ndarray, "height width"]]]
+) -> VisualHull:
+    """The visual hull of masks, given as names of views, their cameras, and where they see the reflector.
+
+    A point belongs to the hull where it lies in the volume and no mask that it projects into excludes it. The surface
+    is found where the edges of a grid cross it (the corners of marching cubes, Lorensen and Cline 1987).
     """
     grid, cell = _grid(volume)
     inside = _soft_inside(volume, grid.reshape(-1, 3), masks, cell).reshape(grid.shape[:3])
-    points, normals = _crossings(grid, inside, cell)
-    if not len(points):
-        return volume.sample_surface(count, rng)
-    # Edges cross a surface evenly up to their slant: |n_x| + |n_y| + |n_z| crossings an area.
-    density = 1 / np.abs(normals).sum(1)
-    chosen = rng.choice(len(points), count, p=density / density.sum())
-    spread = rng.uniform(-0.5, 0.5, (count, 3)) * cell
-    spread -= (spread * normals[chosen]).sum(1, keepdims=True) * normals[chosen]
-    spread[~volume.contains(points[chosen] + spread)] = 0
-    return points[chosen] + spread, normals[chosen]
+    return VisualHull(volume, *_crossings(grid, inside, cell), cell)
 
 
 def _grid(volume: ReflectionVolume) -> tuple[Float[np.ndarray, "x y z 3"], float]:

@@ -11,10 +11,9 @@ from catacaustics.capture.dataset import Capture
 from catacaustics.config import SplatConfig, TrainConfig
 from catacaustics.environment import EnvironmentMap
 from catacaustics.errors import UserError
-from catacaustics.reflectors.fit import fit_bowl, fit_ellipsoid, fit_plane, fit_revolution, fit_sphere, surroundings
+from catacaustics.reflectors.fit import fit_bowl, fit_ellipsoid, fit_plane, fit_sphere, surroundings
 from catacaustics.reflectors.revolution import Revolution
-from catacaustics.reflectors.visual_hull import sample_visual_hull
-from catacaustics.reflectors.volume import ReflectionVolume, volume_masks
+from catacaustics.reflectors.volume import ReflectionVolume
 from catacaustics.reflectors.warps import (
     NeuralWarp,
     PlaneWarp,
@@ -27,7 +26,7 @@ from catacaustics.reflectors.warps import (
 from catacaustics.renderer import FEATURES, NeuralRenderer
 from catacaustics.scene import PointParameters, Scene
 from catacaustics.shapes import Float
-from catacaustics.training.mirrors import start_shapes
+from catacaustics.training.mirrors import hull_of, start_shapes, turned_body_of
 from catacaustics.training.photographs import photograph, scaled_camera
 
 INITIAL_OPACITY = 0.8
@@ -144,8 +143,7 @@ def primary_seeds(
     parts = [(cloud.positions, cloud.normals, cloud.colors, np.full(len(cloud), 0.02))]
     for (volume, model), n in zip(reflectors, wanted, strict=True):
         rho = 0.02 if model == "none" else 0.9
-        masks = volume_masks(capture, volume.name)
-        positions, normals = sample_visual_hull(volume, masks, max(int(n * shrink), 100), rng)
+        positions, normals = hull_of(volume, capture).sample(max(int(n * shrink), 100), rng)
         color = mean_reflector_color(capture, volume)
         parts.append((positions, normals, np.broadcast_to(color, positions.shape), np.full(len(positions), rho)))
     columns = [np.concatenate(c).astype(np.float32) for c in zip(*parts, strict=True)]
@@ -221,13 +219,15 @@ def grow_cloud(cloud: PointParameters, seeds: Seeds, count: int) -> PointParamet
 
 
 def start_warps(capture: Capture, reflectors: list[Reflector], config: TrainConfig) -> list[nn.Module]:
-    """The warps of the reflectors' models, started from their volumes; networks from the configuration's seed."""
+    """The warps of the reflectors' models, started from volumes or masks; networks from the configuration's seed."""
     torch.manual_seed(config.seed)
     centers = np.array([v.camera.center for v in capture.train])
-    return [_start_warp(r, centers, config) for r in reflectors]
+    return [_start_warp(r, capture, centers, config) for r in reflectors]
 
 
-def _start_warp(reflector: Reflector, centers: Float[np.ndarray, "m 3"], config: TrainConfig) -> nn.Module:
+def _start_warp(
+    reflector: Reflector, capture: Capture, centers: Float[np.ndarray, "m 3"], config: TrainConfig
+) -> nn.Module:
     volume, model = reflector
 
     def tensors(*arrays: np.ndarray) -> list[torch.Tensor]:
@@ -244,9 +244,7 @@ def _start_warp(reflector: Reflector, centers: Float[np.ndarray, "m 3"], config:
     if model == "ellipsoid":
         return QuadricWarp(*tensors(*fit_ellipsoid(volume)), sphere=False)
     if model == "revolution":
-        points = volume.sample_surface(2000, np.random.default_rng(0))[0]
-        surface, _ = fit_revolution(points, *fit_ellipsoid(volume))
-        return RevolutionWarp(Revolution(*(value.float() for value in surface)))
+        return RevolutionWarp(Revolution(*(value.float() for value in turned_body_of(volume, capture)[0])))
     if model == "concave":
         center, radius = fit_bowl(volume, centers)
         return QuadricWarp(*tensors(center, radius * np.eye(3)), sphere=False, concave=True)
@@ -303,12 +301,11 @@ def seen_through(
     for view in capture.train[:: max(1, len(capture.train) // views)]:
         camera = scaled_camera(view.camera, min(size, config.image_size), 1.0)
         with torch.no_grad():
-            layers = scene.layers(camera)
+            directions, weights = scene.openings(camera)
         colors = torch.from_numpy(photograph(capture, view, camera)).to(scene.device).view(-1, 3)
-        weights = layers.transmittance
         for volume in scene.volumes:
             weights[torch.from_numpy(volume.project_mask(camera))] = 0
-        parts.append((layers.directions.view(-1, 3), colors, weights.reshape(-1)))
+        parts.append((directions.view(-1, 3), colors, weights.reshape(-1)))
     directions, colors, weights = (torch.cat(p) for p in zip(*parts, strict=True))
     return directions, colors, weights
 

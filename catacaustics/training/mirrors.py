@@ -1,5 +1,8 @@
 """The shapes of mirrors before training: fitted to the photographs and to the visual hull of the masks."""
 
+from functools import lru_cache
+from typing import NamedTuple
+
 import numpy as np
 import torch
 
@@ -9,7 +12,8 @@ from catacaustics.config import TrainConfig
 from catacaustics.losses import dssim
 from catacaustics.reflectors import quadric, revolution
 from catacaustics.reflectors.fit import body_loss, fit_bent_sheet, fit_body, fit_ellipsoid, fit_revolution
-from catacaustics.reflectors.visual_hull import sample_visual_hull
+from catacaustics.reflectors.revolution import Revolution
+from catacaustics.reflectors.visual_hull import VisualHull, carve_visual_hull
 from catacaustics.reflectors.volume import ReflectionVolume, volume_masks
 from catacaustics.reflectors.warps import Mirror, PlaneWarp, QuadricNeuralWarp, QuadricWarp, RevolutionWarp
 from catacaustics.scene import Scene, frozen
@@ -22,6 +26,9 @@ _SHAPE_STEPS, _SHAPE_SIZE = 30, 120
 """Steps of each fit, and the longer side of its images."""
 _BODY_WEIGHT = 0.1
 """Of the distance from the visual hull beside the photographs, which say little of a painted mirror's shape."""
+
+_BODY_POINTS = 2000
+"""Of a visual hull, that bodies are fitted to."""
 
 _ROUND, _TURNED = 0.3, 0.5
 """A body is an ellipsoid where its loss (`body_loss`) is below the first; otherwise it is turned where a surface of
@@ -45,13 +52,14 @@ def start_shapes(scene: Scene, capture: Capture, config: TrainConfig) -> None:
             mirror = warp.quadric if isinstance(warp, QuadricNeuralWarp) else warp
             if isinstance(mirror, Mirror):
                 hollow = isinstance(mirror, QuadricWarp) and bool(mirror.concave)
-                points = None if hollow or isinstance(mirror, PlaneWarp) else _hull_points(volume, capture)
+                masked = not (hollow or isinstance(mirror, PlaneWarp))
                 boxes = [_middle_box(volume.scaled(0.6), camera) for _, camera in cameras]
                 seen = [(v, c, box) for (v, c), box in zip(cameras, boxes, strict=True) if box is not None]
                 if seen:
-                    starts = _starts(mirror, volume, points)
-                    body = None if points is None else torch.from_numpy(points).to(scene.device, torch.float32)
-                    _start_shape(scene, capture, mirror, starts, seen, body)
+                    body = body_of(volume, capture) if masked else None
+                    starts = _starts(mirror, volume, body)
+                    points = None if body is None else torch.from_numpy(body.points).to(scene.device, torch.float32)
+                    _start_shape(scene, capture, mirror, starts, seen, points)
 
 
 def _start_shape(
@@ -60,7 +68,7 @@ def _start_shape(
     mirror: Mirror,
     starts: list[list[torch.Tensor]],
     cameras: list[tuple[View, Camera, Viewport]],
-    body: torch.Tensor | None,
+    hull: torch.Tensor | None,
 ) -> None:
     parameters = list(mirror.parameters())
     targets = []
@@ -72,9 +80,9 @@ def _start_shape(
     def error(i: int) -> torch.Tensor:
         image = scene.decode(scene.layers(cameras[i][1], cameras[i][2]))
         shown = (image - targets[i]).abs().mean() + dssim(image, targets[i])
-        if body is None or isinstance(mirror, PlaneWarp):
+        if hull is None or isinstance(mirror, PlaneWarp):
             return shown
-        return shown + _BODY_WEIGHT * off_body(body, mirror)
+        return shown + _BODY_WEIGHT * off_body(hull, mirror)
 
     found = []
     for start in starts:
@@ -103,10 +111,6 @@ def _start_shape(
             tensor.copy_(value)
 
 
-def _hull_points(volume: ReflectionVolume, capture: Capture) -> Float[np.ndarray, "n 3"]:
-    return sample_visual_hull(volume, volume_masks(capture, volume.name), 2000, np.random.default_rng(0))[0]
-
-
 def off_body(points: Float[torch.Tensor, "n 3"], mirror: QuadricWarp | RevolutionWarp) -> Float[torch.Tensor, ""]:
     """How far the points of a visual hull lie from a mirror: the loss of its fits, differentiable."""
     if isinstance(mirror, RevolutionWarp):
@@ -115,20 +119,46 @@ def off_body(points: Float[torch.Tensor, "n 3"], mirror: QuadricWarp | Revolutio
     return body_loss(quadric.distances(points, center, axes) / axes.norm(dim=0).mean())
 
 
-def _nearest_ellipsoid(
-    points: Float[np.ndarray, "n 3"], volume: ReflectionVolume
-) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3 3"], float]:
-    """Centre and half-axes of the ellipsoid in a visual hull, and its loss."""
+@lru_cache(maxsize=16)
+def hull_of(volume: ReflectionVolume, capture: Capture) -> VisualHull:
+    """The visual hull of a reflector's masks; carved once, whoever asks: trials carve the same one again and again."""
+    return carve_visual_hull(volume, volume_masks(capture, volume.name))
+
+
+class Body(NamedTuple):
+    """Points of a visual hull, and centre, half-axes (columns) and loss of the ellipsoid that most of them lie on."""
+
+    points: Float[np.ndarray, "n 3"]
+    center: Float[np.ndarray, "3"]
+    axes: Float[np.ndarray, "3 3"]
+    loss: float
+
+
+def nearest_ellipsoid(points: Float[np.ndarray, "n 3"], volume: ReflectionVolume) -> Body:
+    """The ellipsoid in the points of a visual hull."""
     center, axes = fit_body(points, *fit_ellipsoid(volume), sphere=False)
     shape = (torch.from_numpy(v) for v in (points, center, axes))
-    return center, axes, float(body_loss(quadric.distances(*shape) / np.linalg.norm(axes, axis=0).mean()))
+    return Body(points, center, axes, float(body_loss(quadric.distances(*shape) / np.linalg.norm(axes, axis=0).mean())))
+
+
+@lru_cache(maxsize=16)
+def body_of(volume: ReflectionVolume, capture: Capture) -> Body:
+    """The ellipsoid in a reflector's visual hull."""
+    points = hull_of(volume, capture).sample(_BODY_POINTS, np.random.default_rng(0))[0]
+    return nearest_ellipsoid(points, volume)
+
+
+@lru_cache(maxsize=16)
+def turned_body_of(volume: ReflectionVolume, capture: Capture) -> tuple[Revolution, float]:
+    """The surface of revolution in a reflector's visual hull, and its loss."""
+    body = body_of(volume, capture)
+    return fit_revolution(body.points, body.center, body.axes)
 
 
 def is_turned(volume: ReflectionVolume, capture: Capture) -> bool:
     """Whether a visual hull is a surface of revolution, and not an ellipsoid."""
-    points = _hull_points(volume, capture)
-    center, axes, loss = _nearest_ellipsoid(points, volume)
-    return loss > _ROUND and fit_revolution(points, center, axes)[1] < _TURNED * loss
+    loss = body_of(volume, capture).loss
+    return loss > _ROUND and turned_body_of(volume, capture)[1] < _TURNED * loss
 
 
 def impossible_shapes(volume: ReflectionVolume, capture: Capture) -> dict[str, str]:
@@ -138,25 +168,21 @@ def impossible_shapes(volume: ReflectionVolume, capture: Capture) -> dict[str, s
     return {} if is_turned(volume, capture) else {"revolution": "the masks show an ellipsoid, or no turned shape"}
 
 
-def _starts(
-    mirror: Mirror, volume: ReflectionVolume, points: Float[np.ndarray, "n 3"] | None
-) -> list[list[torch.Tensor]]:
-    """Buffers of a mirror to start from: bowls and planes as they are; convex quadrics in several sizes and as the body
-    in the visual hull, or as cylinders where that is flat and no ellipsoid; surfaces of revolution as that body."""
+def _starts(mirror: Mirror, volume: ReflectionVolume, body: Body | None) -> list[list[torch.Tensor]]:
+    """Buffers of a mirror to start from: convex quadrics in several sizes and as the body in the visual hull, or as
+    cylinders where that is flat and no ellipsoid; all others as they are."""
     start = [b.clone() for b in mirror.buffers()]
-    if points is None:
+    if body is None or isinstance(mirror, RevolutionWarp):
         return [start]
-    if isinstance(mirror, RevolutionWarp):
-        center, axes, _ = _nearest_ellipsoid(points, volume)
-        return [[value.to(start[0]) for value in fit_revolution(points, center, axes)[0]]]
     center, axes, concave = start
     sphere = isinstance(mirror, QuadricWarp) and len(mirror.log_radii) == 1
     sheets = [] if sphere else fit_bent_sheet(volume)
-    if sheets and _nearest_ellipsoid(points, volume)[2] > _ROUND:
+    if sheets and body.loss > _ROUND:
         found, sizes = sheets, ()
     else:
         shape = (t.cpu().numpy().astype(float) for t in (center, axes))
-        found, sizes = [fit_body(points, *shape, sphere=sphere)], _SIZES
+        found = [fit_body(body.points, *shape, sphere=True) if sphere else (body.center, body.axes)]
+        sizes = _SIZES
     others = [[torch.from_numpy(c).to(center), torch.from_numpy(a).to(axes), concave] for c, a in found]
     return [[center, size * axes, concave] for size in sizes] + others
 
