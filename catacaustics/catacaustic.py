@@ -17,7 +17,7 @@ from catacaustics.capture.dataset import Capture, View
 from catacaustics.capture.truth import read_truth, truth_path
 from catacaustics.geometry import normalize
 from catacaustics.scene import Scene
-from catacaustics.shapes import Bool, Float
+from catacaustics.shapes import Float, Int
 
 _LEAST_OPACITY = 0.3
 """Fainter points show nothing that could be followed."""
@@ -57,18 +57,18 @@ def flow_error(scene: Scene, capture: Capture, most_pairs: int = 24) -> FlowErro
     )
 
 
-def displayed_points(
-    scene: Scene, index: int, camera: Camera
-) -> tuple[Float[np.ndarray, "n 3"], Bool[np.ndarray, "n"]]:
-    """Where the points of reflection cloud `index` appear for a camera, and which of them do."""
+def displayed_points(scene: Scene, index: int, camera: Camera) -> tuple[Float[np.ndarray, "n 3"], Int[np.ndarray, "n"]]:
+    """Where points of reflection cloud `index` appear for a camera, and their rows: those that appear at all, some of
+    them several times."""
     cloud = scene.reflections[index]
     center = torch.tensor(camera.center, dtype=cloud.positions.dtype, device=cloud.positions.device)
     with torch.no_grad():
         shown = scene.warps[index](cloud.positions, center)
-        visible = torch.sigmoid(cloud.opacity_logits) > _LEAST_OPACITY
+        rows = torch.arange(len(cloud.positions), device=center.device) if shown.rows is None else shown.rows
+        visible = torch.sigmoid(cloud.opacity_logits[rows]) > _LEAST_OPACITY
         if shown.visible is not None:
             visible &= shown.visible
-    return shown.positions.detach().cpu().numpy().astype(np.float64), visible.cpu().numpy()
+    return shown.positions.detach()[visible].cpu().numpy().astype(np.float64), rows[visible].cpu().numpy()
 
 
 def _pair_errors(scene: Scene, capture: Capture, first: View, second: View) -> tuple[np.ndarray, np.ndarray]:
@@ -79,8 +79,8 @@ def _pair_errors(scene: Scene, capture: Capture, first: View, second: View) -> t
     truth = [read_truth(capture.root, v.name) for v in (first, second)]
     errors, still = [], []
     for i, volume in enumerate(scene.volumes):
-        before, seen = displayed_points(scene, i, first.camera)
-        after, seen_again = displayed_points(scene, i, second.camera)
+        before, rows = displayed_points(scene, i, first.camera)
+        after, rows_again = displayed_points(scene, i, second.camera)
         pixels, depth = first.camera.project(before)
         cells = np.floor(pixels).astype(int)
         height, width = truth[0].mirror_mask.shape
@@ -88,7 +88,7 @@ def _pair_errors(scene: Scene, capture: Capture, first: View, second: View) -> t
         cells = np.where(inside[:, None], cells, 0)
         sources = truth[0].source[cells[:, 1], cells[:, 0]]
         own = volume.project_mask(first.camera)[cells[:, 1], cells[:, 0]]
-        usable = inside & seen & seen_again & own & np.isfinite(sources).all(1)
+        usable = inside & np.isin(rows, rows_again) & own & np.isfinite(sources).all(1)
         # Where is the same thing mirrored in the second view?
         region = np.isfinite(truth[1].source).all(-1) & volume.project_mask(second.camera)
         if not usable.any() or not region.any():
@@ -97,13 +97,24 @@ def _pair_errors(scene: Scene, capture: Capture, first: View, second: View) -> t
         gap, nearest = map(np.asarray, KDTree(truth[1].source[region]).query(sources[usable]))
         same = gap < _SAME_PLACE * np.linalg.norm(sources[usable] - volume.center, axis=1)
         true = rays[nearest[same]]
-        shown = normalize(after[usable][same] - second.camera.center)
-        errors.append(_angle(shown, true))
+        errors.append(_least_angles(rows[usable][same], true, rows_again, normalize(after - second.camera.center)))
         stuck = _surface_points(first.camera, before[usable][same], volume.center, volume.radius)
         still.append(_angle(normalize(stuck - second.camera.center), true))
     if not errors:
         return np.zeros(0), np.zeros(0)
     return np.concatenate(errors), np.concatenate(still)
+
+
+def _least_angles(rows: np.ndarray, true: np.ndarray, rows_again: np.ndarray, shown: np.ndarray) -> np.ndarray:
+    """Degrees between true directions of points and the nearest of the directions in which each is shown: a mirror that
+    is bent inwards shows one several times, and the truth tells one of them."""
+    order = np.argsort(rows_again, kind="stable")
+    first, end = (np.searchsorted(rows_again[order], rows, side) for side in ("left", "right"))
+    angles = np.full(len(rows), np.inf)
+    for k in range(int((end - first).max(initial=0))):
+        more = first + k < end
+        angles[more] = np.minimum(angles[more], _angle(shown[order[first[more] + k]], true[more]))
+    return angles
 
 
 def _surface_points(camera: Camera, points: np.ndarray, center: np.ndarray, radius: float) -> np.ndarray:
@@ -144,12 +155,22 @@ def caustic_errors(
     cameras: Float[Tensor, "n 3"],
 ) -> Float[np.ndarray, "n"]:
     """Degrees between where a warp displays a point and the catacaustic of the source that it stands for, seen from
-    each of the camera centres."""
+    each of the camera centres; nan where it does not."""
     angles = []
     for camera in cameras:
-        with torch.no_grad():
-            shown = warp(point[None], camera).positions[0]
-            true = sphere_caustic(source, center, radius, camera)
+        true = sphere_caustic(source, center, radius, camera)
+        shown = nearest_image(warp, point, camera, true)
         pair = [normalize((p - camera).double().numpy()[None]) for p in (shown, true)]
         angles.append(float(_angle(*pair)[0]))
     return np.array(angles)
+
+
+def nearest_image(
+    warp: nn.Module, point: Float[Tensor, "3"], camera: Float[Tensor, "3"], true: Float[Tensor, "3"]
+) -> Float[Tensor, "3"]:
+    """Where a warp displays a point, nearest to a place if there are several; nan where it does not."""
+    with torch.no_grad():
+        positions = warp(point[None], camera).positions.detach()
+    if not len(positions):
+        return torch.full_like(point, torch.nan)
+    return positions[(positions - true).norm(dim=1).argmin()]

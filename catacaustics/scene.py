@@ -90,7 +90,8 @@ class Motion(NamedTuple):
 
 
 class ReflectionDisks(NamedTuple):
-    """One reflection cloud as a view shows it: its rows that can land in the viewport, and their disks."""
+    """One reflection cloud as a view shows it: its rows that can land in the viewport (some several times, where a
+    mirror shows several images of a point), and their disks."""
 
     rows: Int[Tensor, "n"]
     positions: Float[Tensor, "n 3"]
@@ -299,15 +300,17 @@ class Scene(nn.Module):
 
         with torch.no_grad():
             shown = show(cloud.positions)
-            footprints = _stretched(cloud.log_footprints.exp(), shown.stretch)
+            footprints = cloud.log_footprints.exp()
+            footprints = _stretched(footprints if shown.rows is None else footprints[shown.rows], shown.stretch)
             near = points_in_view(shown.positions, footprints, camera, viewport, self.splatting)
             if shown.visible is not None:
                 near = near[shown.visible[near]]
             normals, stretch, start = (
                 None if t is None else t.index_select(0, near) for t in (shown.normals, shown.stretch, shown.start)
             )
+            rows = near if shown.rows is None else shown.rows[near]
         # Only points that can land in the viewport are warped with gradients, and only positions have them.
-        positions, _, log_footprints, logits, features = _rows(cloud, near)
+        positions, _, log_footprints, logits, features = _rows(cloud, rows)
         displayed = show(positions, start).positions
         if motion is not None:
             displayed = motion.apply(displayed, center)
@@ -315,7 +318,7 @@ class Scene(nn.Module):
         if normals is None:
             normals = torch.nn.functional.normalize(center - displayed.detach(), dim=1)
         footprints = _stretched(log_footprints.exp(), stretch)
-        return ReflectionDisks(near, displayed, normals, footprints, torch.sigmoid(logits), features)
+        return ReflectionDisks(rows, displayed, normals, footprints, torch.sigmoid(logits), features)
 
     def save(self, path: Path, extra: dict[str, Tensor] | None = None, notes: dict | None = None) -> None:
         """Write the scene, atomically, as one safetensors file; `extra` tensors and JSON `notes` travel along."""

@@ -116,11 +116,21 @@ def reflection_disparity(scene: Scene, camera: Camera, rig: Rig) -> Disparity:
 
     def displayed(index: int, disks: ReflectionDisks) -> Float[np.ndarray, "n 3"]:
         other = scene.reflection_disks(index, right, warp_camera=follows)
-        places = disks.positions.new_full((len(scene.reflections[index].positions), 3), torch.nan)
-        places[other.rows] = other.positions
-        return _float64(places[disks.rows])
+        return _same_images(disks, other, scene.volumes[index].radius)
 
     return _disparity(scene, camera, rig, displayed)
+
+
+def _same_images(disks: ReflectionDisks, other: ReflectionDisks, size: float) -> Float[np.ndarray, "n 3"]:
+    """The other eye's images of the same points, the nearest ones where a mirror shows several; nan where none."""
+    from scipy.spatial import KDTree
+
+    apart = 1e6 * size  # images of different points are never near
+    here, there = (np.c_[apart * d.rows.cpu().numpy()[:, None], _float64(d.positions)] for d in (disks, other))
+    if not len(there):
+        return np.full((len(here), 3), np.nan)
+    gap, nearest = map(np.asarray, KDTree(there).query(here))
+    return np.where(gap[:, None] < apart / 2, there[nearest, 1:], np.nan)
 
 
 def surface_disparity(scene: Scene, camera: Camera, rig: Rig) -> Disparity:

@@ -124,21 +124,24 @@ def spread_points(scene: Scene, index: int, camera: Camera, count: int, least_we
         pixel = free[room.argmax()]
         room = np.minimum(room, np.linalg.norm(free - pixel, axis=1))
         point = point_at(scene, index, camera, pixel, disks)
-        if point not in chosen and _weight(scene, index, camera, point, disks) >= least_weight:
+        if point not in chosen and _images(scene, index, camera, point, disks)[1].max(initial=0) >= least_weight:
             chosen.append(point)
         if len(chosen) == count or room.max() < 1:
             break
     return chosen
 
 
-def _weight(scene: Scene, index: int, camera: Camera, point: int, disks: Sequence[ReflectionDisks]) -> float:
-    """A point's share of the reflections at its own middle; 0 outside the image."""
+def _images(
+    scene: Scene, index: int, camera: Camera, point: int, disks: Sequence[ReflectionDisks]
+) -> tuple[Float[np.ndarray, "k 2"], Float[np.ndarray, "k"]]:
+    """Pixels of a point's images, and its share of the reflections at each; 0 outside the picture."""
     positions = disks[index].positions[disks[index].rows == point].cpu().numpy().astype(np.float64)
-    pixel = camera.project(positions)[0].reshape(-1)
-    if not len(pixel) or not ((pixel >= 0) & (pixel < [camera.width, camera.height])).all():
-        return 0.0
-    rows, shares = blending_weights(scene, index, camera, pixel, disks)
-    return float(shares[rows == point].sum())
+    pixels = camera.project(positions)[0]
+    weights = np.zeros(len(pixels))
+    for i in np.flatnonzero(((pixels >= 0) & (pixels < [camera.width, camera.height])).all(1)):
+        rows, shares = blending_weights(scene, index, camera, pixels[i], disks)
+        weights[i] = float(shares[rows == point].sum())
+    return pixels, weights
 
 
 def _reflecting(scene: Scene, index: int, camera: Camera) -> Bool[np.ndarray, "height width"]:
@@ -152,7 +155,8 @@ def _reflecting(scene: Scene, index: int, camera: Camera) -> Bool[np.ndarray, "h
 def follow_points(
     scene: Scene, index: int, points: Sequence[int], cameras: Sequence[Camera], least_weight: float = 0.05
 ) -> Tracks:
-    """Where views show points of reflection cloud `index`.
+    """Where views show points of reflection cloud `index`; where a mirror shows several images of a point, that with
+    the largest share of the reflections, and from then on the one nearest to where it was.
 
     Args:
         least_weight: a point is visible where it has this share of the reflections at its middle's pixel, and that
@@ -164,15 +168,17 @@ def follow_points(
     pixels = np.full((len(cameras), count, 2), np.nan)
     weights = np.zeros((len(cameras), count))
     visible = np.zeros((len(cameras), count), bool)
+    last = np.full((count, 2), np.nan)
     for k, camera in enumerate(tqdm(cameras, desc="tracks", unit="view")):
         inside = _reflecting(scene, index, camera)
         disks = _all_disks(scene, camera)
-        place = {row: i for i, row in enumerate(disks[index].rows.tolist())}
         for j, point in enumerate(points):
-            if point in place:
-                position = disks[index].positions[place[point]].cpu().numpy().astype(np.float64)
-                pixels[k, j] = camera.project(position)[0]
-                weights[k, j] = _weight(scene, index, camera, point, disks)
+            places, shares = _images(scene, index, camera, point, disks)
+            if len(places):
+                near = np.linalg.norm(places - last[j], axis=1)
+                image = near.argmin() if np.isfinite(last[j]).all() else shares.argmax()
+                pixels[k, j], weights[k, j] = places[image], shares[image]
+                last[j] = places[image]
             if weights[k, j] >= max(least_weight, 1e-9):
                 x, y = np.floor(pixels[k, j]).astype(int)
                 visible[k, j] = inside[y, x]

@@ -64,7 +64,8 @@ def random_points(count, nearest=1.2, seed=1):
 
 
 def displayed(sources, camera, surface):
-    points = specular_points(sources, camera, surface).points
+    found = specular_points(sources, camera, surface)
+    points, sources = found.points[found.visible], sources[found.rows[found.visible]]
     ray = points - camera
     length = ray.norm(dim=1) + (sources - points).norm(dim=1)
     return camera + ray / ray.norm(dim=1, keepdim=True) * length[:, None]
@@ -95,13 +96,70 @@ def test_the_derivatives_of_a_profile_are_those_of_its_values():
 def test_an_ellipsoid_of_revolution_shows_everything_where_the_quadric_does():
     surface, sources = ellipsoid(), random_points(2000)
     expected = quadric.specular_points(sources, CAMERA, CENTER, surface.frame * surface.radii)
-    # Started from a ball, so that the way from there is tested too.
-    found = specular_points(sources, CAMERA, surface._replace(radii=torch.full((3,), 0.6, dtype=torch.float64)))
+    found = specular_points(sources, CAMERA, surface)
+    seen, rows = found.visible, found.rows[found.visible]
     assert expected.visible.sum() > 1000
-    assert torch.equal(found.visible, expected.visible)
-    seen = expected.visible
-    torch.testing.assert_close(found.points[seen], expected.points[seen], rtol=0, atol=1e-10)
-    torch.testing.assert_close(found.jacobian[seen], expected.jacobian[seen], rtol=0, atol=1e-10)
+    # A thing close to the mirror, seen near its rim, may be missed; none is found twice.
+    missed = torch.ones(len(sources)).index_fill(0, rows, 0) * expected.visible
+    assert missed.sum() < 0.005 * expected.visible.sum()
+    assert len(rows.unique()) == len(rows)
+    assert expected.visible[rows].all()
+    torch.testing.assert_close(found.points[seen], expected.points[rows], rtol=0, atol=1e-10)
+    torch.testing.assert_close(found.jacobian[seen], expected.jacobian[rows], rtol=0, atol=1e-10)
+
+
+def clear(surface, points, directions):
+    """Whether rays from a mirror leave it without meeting it again: by a fine march."""
+    at, ways = (points - surface.center) @ surface.frame, directions @ surface.frame
+    free = torch.ones(len(points), dtype=torch.bool)
+    for distance in (3 * torch.linspace(0, 1, 400, dtype=torch.float64)[1:] ** 2).tolist():
+        here = at + distance * ways
+        between = (here[:, 2] > surface.ends[0]) & (here[:, 2] < surface.ends[1])
+        free &= ~(between & (here[:, :2].square().sum(1) < profile(surface, here[:, 2])[0]))
+    return free
+
+
+def mirrored(surface, camera, count=4000):
+    """Random points of a mirror that a camera sees, and things farther off that are mirrored there."""
+    generator = torch.Generator().manual_seed(0)
+    z, turn, far = (torch.rand(count, generator=generator, dtype=torch.float64) for _ in range(3))
+    z, turn = surface.ends[0] + z * (surface.ends[1] - surface.ends[0]), 2 * torch.pi * turn
+    radius = profile(surface, z)[0].clamp_min(0).sqrt()
+    local = torch.stack([radius * turn.cos(), radius * turn.sin(), z], 1)
+    at = (surface.center + local @ surface.frame.T).requires_grad_()
+    normal = torch.nn.functional.normalize(torch.autograd.grad(distances(surface, at).sum(), at)[0], dim=1)
+    at = at.detach()
+    to_camera = torch.nn.functional.normalize(camera - at, dim=1)
+    cosine = (to_camera * normal).sum(1)
+    away = 2 * cosine[:, None] * normal - to_camera
+    seen = (cosine > 0.02) & clear(surface, at, to_camera) & clear(surface, at, away)
+    return at[seen], (at + (0.3 + 3 * far[:, None]) * away)[seen]
+
+
+@pytest.mark.parametrize("camera", [[3.0, 1.5, 0.7], [1.0, 0.3, 3.0]])
+def test_what_a_vase_mirrors_is_found_wherever_it_is_seen(camera):
+    surface, camera = vase(), torch.tensor(camera, dtype=torch.float64)
+    at, sources = mirrored(surface, camera)
+    found = specular_points(sources, camera, surface)
+    rows, points = found.rows[found.visible], found.points[found.visible]
+    nearest = torch.full((len(at),), 9.0, dtype=torch.float64)
+    nearest.scatter_reduce_(0, rows, (points - at[rows]).norm(dim=1), "amin")
+    assert len(at) > 1000
+    assert (nearest < 1e-6).double().mean() > 0.985
+    images = rows.bincount(minlength=len(at))
+    assert (images > 1).sum() > 30  # in the belly, and in the neck or the mouth
+    twice = torch.cdist(points[rows == images.argmax()], points[rows == images.argmax()])
+    assert (twice + torch.eye(len(twice)) > 1e-3).all()
+
+
+def test_no_image_is_seen_through_the_mirror():
+    surface = vase()
+    _, sources = mirrored(surface, CAMERA)
+    found = specular_points(sources, CAMERA, surface)
+    at = found.points[found.visible]
+    for target in (CAMERA.expand_as(at), sources[found.rows[found.visible]]):
+        way = torch.nn.functional.normalize(target - at, dim=1)
+        assert clear(surface, at + 0.01 * way, way).double().mean() > 0.995
 
 
 def test_at_a_point_of_reflection_of_a_vase_the_angles_of_incidence_and_reflection_are_equal():
@@ -113,30 +171,16 @@ def test_at_a_point_of_reflection_of_a_vase_the_angles_of_incidence_and_reflecti
     torch.testing.assert_close(height, torch.zeros_like(height), rtol=0, atol=1e-9)
     normal = torch.nn.functional.normalize(torch.autograd.grad(height.sum(), x)[0], dim=1)
     to_camera = torch.nn.functional.normalize(CAMERA - x, dim=1)
-    to_source = torch.nn.functional.normalize(sources[found.visible] - x, dim=1)
-    mirrored = 2 * (to_camera * normal).sum(1, keepdim=True) * normal - to_camera
-    torch.testing.assert_close(mirrored, to_source, rtol=0, atol=1e-6)
-
-
-def test_on_the_belly_of_a_vase_no_path_over_points_nearby_is_shorter():
-    surface, sources = vase(), random_points(200)
-    found = specular_points(sources, CAMERA, surface)
-    x = found.points[found.visible]
-    shortest = (x - CAMERA).norm(dim=1) + (sources[found.visible] - x).norm(dim=1)
-    for shift in 0.02 * torch.nn.functional.normalize(torch.randn(30, 3, dtype=torch.float64), dim=1):
-        near = x + shift
-        for _ in range(4):
-            near = near.detach().requires_grad_()
-            height = distances(surface, near)
-            near = near - height[:, None] * torch.autograd.grad(height.sum(), near)[0]
-        path = (near - CAMERA).norm(dim=1) + (sources[found.visible] - near).norm(dim=1)
-        assert (path > shortest - 1e-9).all()
+    to_source = torch.nn.functional.normalize(sources[found.rows[found.visible]] - x, dim=1)
+    away = 2 * (to_camera * normal).sum(1, keepdim=True) * normal - to_camera
+    torch.testing.assert_close(away, to_source, rtol=0, atol=1e-6)
 
 
 def test_derivatives_agree_with_finite_differences_for_source_camera_place_axis_and_profile():
     surface = vase()
     sources = random_points(300)
-    sources = sources[specular_points(sources, CAMERA, surface).visible][:12]
+    found = specular_points(sources, CAMERA, surface)
+    sources = sources[found.rows[found.visible].unique()[:12]]
 
     def points(sources, camera, center, turn, squared):
         moved = surface._replace(center=center, frame=rotation_matrix(turn), squared=squared)
@@ -151,10 +195,12 @@ def test_the_footprint_jacobian_is_the_derivative_of_the_displayed_point():
     sources = random_points(300)
     found = specular_points(sources, CAMERA, surface)
     one = found.visible.nonzero()[5, 0]
+    source = sources[found.rows[one]]
+    assert (found.rows == found.rows[one]).sum() == 1
     ray = torch.nn.functional.normalize(found.points[one] - CAMERA, dim=0)
-    whole = torch.autograd.functional.jacobian(lambda p: displayed(p[None], CAMERA, surface)[0], sources[one])
+    whole = torch.autograd.functional.jacobian(lambda p: displayed(p[None], CAMERA, surface)[0], source)
     flat = (torch.eye(3, dtype=torch.float64) - ray[:, None] * ray) @ whole
-    to_source = torch.nn.functional.normalize(sources[one] - found.points[one], dim=0)
+    to_source = torch.nn.functional.normalize(source - found.points[one], dim=0)
     across = flat @ (torch.eye(3, dtype=torch.float64) - to_source[:, None] * to_source)
     torch.testing.assert_close(found.jacobian[one], across, rtol=1e-6, atol=1e-9)
 
@@ -162,7 +208,7 @@ def test_the_footprint_jacobian_is_the_derivative_of_the_displayed_point():
 def test_a_solution_that_is_handed_back_saves_solving_and_changes_nothing():
     surface, sources = vase(), random_points(100)
     found = specular_points(sources, CAMERA, surface)
-    again = specular_points(sources, CAMERA, surface, found.start)
+    again = specular_points(sources[found.rows], CAMERA, surface, found.start)
     assert torch.equal(again.points, found.points)
     assert again.visible is None
 
@@ -172,6 +218,7 @@ def test_nothing_is_ever_nan_for_points_inside_on_behind_or_in_line_with_the_mir
     surface = Revolution(*(v.to(dtype) for v in vase()))
     axis, middle = surface.frame[:, 2], surface.center
     on = specular_points(random_points(50).to(dtype), CAMERA.to(dtype), surface).points
+    assert len(on) > 20
     inside = middle + 0.2 * (random_points(50, nearest=0).to(dtype) - middle) / 4
     along = middle + torch.linspace(-5, 5, 41, dtype=dtype)[:, None] * axis
     behind = middle - torch.linspace(0.5, 5, 20, dtype=dtype)[:, None] * (CAMERA.to(dtype) - middle)
@@ -185,17 +232,18 @@ def test_nothing_is_ever_nan_for_points_inside_on_behind_or_in_line_with_the_mir
         for tensor in (found.points, found.jacobian, sources.grad, squared.grad):
             assert torch.isfinite(tensor).all()
         is_inside = distances(surface, sources.detach()) < -1e-4
-        assert not found.visible[is_inside].any()
+        assert not found.visible[is_inside[found.rows]].any()
 
 
 def test_float32_finds_the_points_of_float64():
     surface, sources = vase(), random_points(1000)
     exact = specular_points(sources, CAMERA, surface)
     rough = specular_points(sources.float(), CAMERA.float(), Revolution(*(v.float() for v in surface)))
-    both = exact.visible & rough.visible
-    assert both.sum() > 0.99 * exact.visible.sum()
-    error = (rough.points.double() - exact.points)[both].norm(dim=1)
-    assert error.quantile(0.99) < 1e-4
+    points, rows = exact.points[exact.visible], exact.rows[exact.visible]
+    found, owners = rough.points.double()[rough.visible], rough.rows[rough.visible]
+    error = torch.where(rows[:, None] == owners, torch.cdist(points, found), torch.inf).amin(1)
+    assert (error < 1e-4).double().mean() > 0.99
+    assert len(owners) < 1.01 * len(rows)
 
 
 def test_distances_along_rays_are_a_balls_closed_form_and_nan_beside_it():

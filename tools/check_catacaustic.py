@@ -18,7 +18,7 @@ import tyro
 from catacaustics.cameras import interpolate_path
 from catacaustics.capture.dataset import Capture
 from catacaustics.capture.truth import read_reflectors, read_truth, truth_path
-from catacaustics.catacaustic import caustic_errors, displayed_points, flow_error, sphere_caustic
+from catacaustics.catacaustic import caustic_errors, displayed_points, flow_error, nearest_image, sphere_caustic
 from catacaustics.errors import UserError
 from catacaustics.files import write_json
 from catacaustics.run import Run, open_run
@@ -49,16 +49,16 @@ def followed_points(scene: Scene, capture: Capture) -> tuple[np.ndarray, np.ndar
     """Indices of reflection points and the world positions that they stand for, from one training view with truth."""
     view = next(v for v in capture.train if truth_path(capture.root, v.name).is_file())
     source = read_truth(capture.root, view.name).source
-    shown, visible = displayed_points(scene, 0, view.camera)
+    shown, rows = displayed_points(scene, 0, view.camera)
     pixels, depth = view.camera.project(shown)
     cells = np.floor(pixels).astype(int)
-    inside = visible & (depth > 0) & (cells >= 0).all(1) & (cells < source.shape[1::-1]).all(1)
+    inside = (depth > 0) & (cells >= 0).all(1) & (cells < source.shape[1::-1]).all(1)
     index = np.flatnonzero(inside)
     found = source[cells[index, 1], cells[index, 0]]
     usable = np.isfinite(found).all(1)
     index, found = index[usable], found[usable]
     pick = np.random.default_rng(0).permutation(len(index))[:_POINTS]
-    return index[pick], found[pick]
+    return rows[index[pick]], found[pick]
 
 
 def against_caustics(run: Run, capture: Capture, sphere: dict[str, Any]) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -72,14 +72,17 @@ def against_caustics(run: Run, capture: Capture, sphere: dict[str, Any]) -> tupl
     for i, source in zip(index.tolist(), torch.from_numpy(sources.astype(np.float32)), strict=True):
         errors.append(caustic_errors(warp, points[i], source, center, radius, cameras))
         if len(curves) < 3:
-            true = np.array([sphere_caustic(source, center, radius, c).numpy() for c in cameras])
-            with torch.no_grad():
-                shown = np.array([warp(points[i][None], c).positions[0].numpy() for c in cameras])
+            places = [sphere_caustic(source, center, radius, c) for c in cameras]
+            shown = np.array(
+                [nearest_image(warp, points[i], c, t).numpy() for c, t in zip(cameras, places, strict=True)]
+            )
+            true = np.array([t.numpy() for t in places])
             # Only the direction is seen: put the displayed point at the catacaustic's distance.
             eyes = cameras.numpy()
             ray = (shown - eyes) / np.linalg.norm(shown - eyes, axis=1, keepdims=True)
             curves.append(np.c_[true, eyes + ray * np.linalg.norm(true - eyes, axis=1, keepdims=True)])
-    return np.concatenate(errors), curves
+    angles = np.concatenate(errors)
+    return angles[np.isfinite(angles)], curves
 
 
 def draw(path: Path, sphere: dict[str, Any], curves: dict[str, list[np.ndarray]]) -> None:

@@ -104,9 +104,9 @@ def strayed(scene: Scene, capture: Capture) -> float:
     """Share of the reflection points that are shown, but nowhere in the outline of their volume: from the middle
     training view, with a margin of a quarter of the volume's radius."""
     camera = capture.train[len(capture.train) // 2].camera
-    shown, visible = displayed_points(scene, 0, camera)
+    shown, _ = displayed_points(scene, 0, camera)
     wide = scene.volumes[0].scaled(1.25).project_mask(camera)
-    pixels, depth = camera.project(shown[visible])
+    pixels, depth = camera.project(shown)
     cells = np.floor(pixels).astype(int)
     inside = (depth > 0) & (cells >= 0).all(1) & (cells < [camera.width, camera.height]).all(1)
     cells = np.where(inside[:, None], cells, 0)

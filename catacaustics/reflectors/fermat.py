@@ -8,7 +8,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from catacaustics.shapes import Bool, Float
+from catacaustics.shapes import Bool, Float, Int
 
 _GRAZING = 1e-3
 """Cosine of incidence below which a point counts as invisible: the rim, where the image shrinks to nothing."""
@@ -22,12 +22,14 @@ class Specular(NamedTuple):
     """Points of reflection: differentiable `points`; `visible` where camera and source face the mirror there and the
     path is stationary; `jacobian` (no gradients), the map from displacements of the source to displacements of the
     displayed point, which lies on the ray at the length of the path; `start`, the solution, which saves solving again
-    for the same arguments: then `visible` and `jacobian` are None, as they are known."""
+    for the same arguments: then `visible` and `jacobian` are None, as they are known; `rows`, which source each is an
+    image of, where the mirror shows some several times and others not at all (None: one each, in order)."""
 
     points: Float[Tensor, "n 3"]
     visible: Bool[Tensor, "n"] | None
     jacobian: Float[Tensor, "n 3 3"] | None
     start: Float[Tensor, "n 3"]
+    rows: Int[Tensor, "n"] | None = None
 
 
 class Path(NamedTuple):

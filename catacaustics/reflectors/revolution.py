@@ -1,9 +1,8 @@
 """Where a mirror of revolution shows a point: Fermat's principle on x^2 + y^2 = q(z), q a cubic B-spline.
 
 The squared radius q is smooth where the mirror meets its axis, and of an ellipsoid of revolution it is quadratic in z:
-vases, bottles and lamps are as easy as balls. Where the mirror is bent inwards, as at a neck, a source can be seen at
-several points; the one that is kept is found downhill, along shorter paths, from where an ellipsoid about as large
-would show it.
+vases, bottles and lamps are as easy as balls. A lamp above a vase can be seen in its belly, its neck and its lip: all
+images are found, where the length of the path changes between rising and falling along the mirror's profile.
 """
 
 from typing import NamedTuple
@@ -14,7 +13,6 @@ from torch import Tensor
 from catacaustics.reflectors.fermat import (
     Path,
     Specular,
-    convex,
     display_jacobian,
     path_over,
     reflects,
@@ -22,14 +20,23 @@ from catacaustics.reflectors.fermat import (
     solve2,
     tangents,
 )
-from catacaustics.reflectors.quadric import stationary
-from catacaustics.shapes import Float
+from catacaustics.shapes import Bool, Float, Int
 
-_ROUGHLY = 1
-"""Newton steps on the ellipsoid that a start is found on."""
-_ITERATIONS = 12
-_MAX_STEP = 0.4
+_RINGS = 2
+"""Heights a spline cell at which images are looked for: two images of a point at less distance are not told apart."""
+_TURNS = 3
+"""Times that a ring's nearest point is improved before it is asked whether the path rises or falls there."""
+_ASTRAY = 4.0
+"""Rings that an image can be away from where it was looked for."""
+_SAME = 1e-4
+"""Images of a point that are nearer to each other than this, in units of the mean radius, are the same."""
+_ITERATIONS = 8
+_MAX_STEP = 0.1
 """Newton steps are cut to this, in units of the mean radius."""
+_HIDERS = 6
+"""Places along a path where it is asked whether the mirror itself is in the way."""
+_BLOCK = 4096
+"""Sources are searched in blocks that stay in the processor's cache."""
 _OFF = 1e-3
 """A point farther from the mirror than this, in units of the mean radius, has not been found."""
 
@@ -137,11 +144,15 @@ def specular_points(
     Args:
         sources: world positions of what is mirrored.
         camera: camera centre.
-        start: what an earlier call returned for the same arguments.
+        start: what an earlier call returned for the rows of these sources and the same camera.
     """
+    rows, at = None, start
     size = float(surface.radii.detach().mean())
+    if at is None:
+        with torch.no_grad():
+            rows, at = _images(sources, camera, surface, size)
+        sources = sources[rows]
     with torch.no_grad():
-        at = _solve(sources, camera, surface, size) if start is None else start
         path, level = path_over(at, sources, camera), _level(surface, at)
         steepness = level.gradient.norm(dim=1, keepdim=True).clamp_min(1e-9 * size)
         normal = level.gradient / steepness
@@ -153,14 +164,15 @@ def specular_points(
     rest = -(towards.to_camera + towards.to_source) - multiplier * here.gradient
     step = solve2(hessian, torch.einsum("nij,ni->nj", basis, rest) + slant * off)
     points = at - torch.einsum("nij,nj->ni", basis, shortened(step, _MAX_STEP * size)) + normal * off
-    if start is not None:
+    if rows is None:
         return Specular(points, None, None, at)
     with torch.no_grad():
         z = (at - surface.center) @ surface.frame[:, 2]
         visible = reflects(path, normal) & (z > surface.ends[0]) & (z < surface.ends[1])
         visible &= level.value.abs() < _OFF * size * steepness[:, 0]
+        visible[visible.clone()] = _unhidden(surface, at[visible], camera, sources[visible])
         jacobian = display_jacobian(path, hessian, basis)
-    return Specular(points, visible, jacobian, at)
+    return Specular(points, visible, jacobian, at, rows)
 
 
 def _lagrangian(
@@ -181,29 +193,104 @@ def _lagrangian(
     return hessian, slant
 
 
-def _solve(sources: Tensor, camera: Tensor, surface: Revolution, size: float) -> Tensor:
-    """Stationary points on the surface, by Newton's method along it from those on the ellipsoid."""
-    axes = surface.frame * surface.radii
-    x = surface.center + stationary(sources, camera, surface.center, axes, False, _ROUGHLY) @ axes.T
-    x = _onto(surface, x, size, 3)
+def _images(
+    sources: Tensor, camera: Tensor, surface: Revolution, size: float
+) -> tuple[Int[Tensor, "m"], Float[Tensor, "m 3"]]:
+    """Rows of sources, and stationary points on the mirror's outside, one for each of their images: Newton's method
+    from where the path stops rising or falling along the profile."""
+    parts = [_roughly(block, camera, surface) for block in sources.split(_BLOCK)]
+    rows = torch.cat([part[0] + i * _BLOCK for i, part in enumerate(parts)])
+    x = torch.cat([part[1] for part in parts])
+    first = (x - surface.center) @ surface.frame[:, 2]
     # Newton's method doubles the digits: the last, differentiated step reaches the rest.
     tolerance = size * torch.finfo(x.dtype).eps ** 0.6
     active = torch.arange(len(x), device=x.device)
     for _ in range(_ITERATIONS):
         here = x[active]
-        path, level = path_over(here, sources[active], camera), _level(surface, here)
+        path, level = path_over(here, sources[rows[active]], camera), _level(surface, here)
         steepness = level.gradient.norm(dim=1, keepdim=True).clamp_min(1e-9 * size)
         normal, uphill = level.gradient / steepness, -(path.to_camera + path.to_source)
         basis, multiplier = tangents(normal), (uphill * normal).sum(1, keepdim=True) / steepness
         hessian, _ = _lagrangian(path, level, surface.frame[:, 2], multiplier, basis, normal)
-        step = solve2(convex(hessian), torch.einsum("nij,ni->nj", basis, uphill))
+        step = solve2(hessian, torch.einsum("nij,ni->nj", basis, uphill))
         step = torch.einsum("nij,nj->ni", basis, shortened(step, _MAX_STEP * size))
         moved = _onto(surface, here - step, size, 1)
         x[active] = moved
         active = active[(moved - here).abs().amax(1) >= tolerance]
         if not len(active):
             break
-    return x
+    z = (x - surface.center) @ surface.frame[:, 2]
+    ring = (surface.ends[1] - surface.ends[0]) / (_RINGS * (len(surface.squared) - 3))
+    kept = (z - first).abs() < _ASTRAY * ring
+    # Images of one source follow each other: two that were found from different rings, and are the same, do too.
+    kept[1:] &= (rows[1:] != rows[:-1]) | ((x[1:] - x[:-1]).abs().amax(1) > _SAME * size)
+    return rows[kept], x[kept]
+
+
+def _roughly(
+    sources: Float[Tensor, "n 3"], camera: Tensor, surface: Revolution
+) -> tuple[Int[Tensor, "m"], Float[Tensor, "m 3"]]:
+    """Rows of sources, and about where on the mirror's outside their images are.
+
+    On a ring about the axis the shortest path leads over the point in whose direction from the axis the unit vectors to
+    camera and source add up. From ring to ring, the path's change along the profile is followed to where its sign does.
+    """
+    z = torch.linspace(0, 1, _RINGS * (len(surface.squared) - 3) + 1, dtype=sources.dtype, device=sources.device)
+    z = surface.ends[0] + z * (surface.ends[1] - surface.ends[0])
+    q, slope, _ = profile(surface, z)
+    radius = q.clamp_min(0).sqrt()
+    eye = (camera - surface.center) @ surface.frame
+    there = (sources - surface.center) @ surface.frame
+    tiny = torch.finfo(z.dtype).tiny ** 0.5
+
+    def unit(point: Tensor, x: Tensor, y: Tensor) -> tuple[Tensor, ...]:
+        a, b, c = point[..., 0, None] - x, point[..., 1, None] - y, point[..., 2, None] - z
+        inverse = torch.rsqrt(a * a + b * b + c * c + tiny)
+        return a * inverse, b * inverse, c * inverse, inverse
+
+    def both(x: Tensor, y: Tensor) -> list[Tensor]:
+        return [a + b for a, b in zip(unit(eye, x, y), unit(there, x, y), strict=True)]
+
+    e = torch.zeros_like(z), torch.zeros_like(z)
+    for _ in range(_TURNS):
+        a, b, _, close = both(radius * e[0], radius * e[1])
+        # Near things turn as the point does: about Newton's step for the angle on the ring.
+        a, b = a + radius * close * e[0], b + radius * close * e[1]
+        inverse = torch.rsqrt(a * a + b * b + tiny)
+        e = a * inverse, b * inverse
+    a, b, up, _ = both(radius * e[0], radius * e[1])
+    outward = a * e[0] + b * e[1]
+    rise = outward * (slope / 2) + radius * up  # minus the path's change, times the radius
+    facing = radius * outward - slope / 2 * up
+    falls = rise > 0
+    turns = (falls[:, 1:] != falls[:, :-1]) & (torch.maximum(facing[:, 1:], facing[:, :-1]) > 0)
+    row, ring = torch.nonzero(turns, as_tuple=True)
+    below, above = rise[row, ring], rise[row, ring + 1]
+    share = (below / (below - above)).nan_to_num(0.5)
+    height = z[ring] + share * (z[ring + 1] - z[ring])
+    direction = torch.stack([(1 - share) * v[row, ring] + share * v[row, ring + 1] for v in e], 1)
+    direction = torch.nn.functional.normalize(direction, dim=1)
+    r = profile(surface, height)[0].clamp_min(0).sqrt()[:, None]
+    return row, surface.center + torch.cat([r * direction, height[:, None]], 1) @ surface.frame.T
+
+
+def _unhidden(
+    surface: Revolution, points: Float[Tensor, "n 3"], camera: Float[Tensor, "3"], sources: Float[Tensor, "n 3"]
+) -> Bool[Tensor, "n"]:
+    """Whether the ways from points on the mirror to camera and source are free of the mirror itself."""
+    start = (points - surface.center) @ surface.frame
+    widest = surface.squared.max().clamp_min(0).sqrt()
+    free = torch.ones(len(points), dtype=torch.bool, device=points.device)
+    for target in (camera.expand_as(points), sources):
+        way = (target - surface.center) @ surface.frame - start
+        # Beyond the widest ring, above and below the ends there is nothing to pass.
+        flat = way[:, :2].norm(dim=1).clamp_min(1e-9 * float(widest))
+        end = torch.where(way[:, 2] > 0, surface.ends[1] - start[:, 2], start[:, 2] - surface.ends[0])
+        reach = torch.minimum((end / way[:, 2].abs().clamp_min(1e-9 * float(widest))), 2 * widest / flat).clamp(0, 1)
+        for i in range(1, _HIDERS + 1):
+            at = start + (i / _HIDERS) * reach[:, None] * way
+            free &= at[:, :2].square().sum(1) > profile(surface, at[:, 2])[0] * 0.999
+    return free
 
 
 def _onto(surface: Revolution, points: Tensor, size: float, steps: int) -> Tensor:

@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from catacaustics.reflectors import quadric, revolution
 from catacaustics.reflectors.fermat import Specular, tilted_disks
 from catacaustics.reflectors.revolution import Revolution
-from catacaustics.shapes import Bool, Float
+from catacaustics.shapes import Bool, Float, Int
 
 Points = Float[Tensor, "n 3"]
 
@@ -22,7 +22,8 @@ Points = Float[Tensor, "n 3"]
 class Displayed(NamedTuple):
     """Where points appear. `normals` None: disks face the camera; `stretch` multiplies squared radii (the footprint's
     Jacobian, no gradients); points that are not `visible` are not drawn; `start` can be handed to the next call;
-    `near` is the distance from the centre to the mirror along a point's ray, where the rung knows its mirror."""
+    `near` is the distance from the centre to the mirror along a point's ray, where the rung knows its mirror; `rows`
+    tells which point each is an image of, where a mirror can show one several times (None: one each, in order)."""
 
     positions: Float[Tensor, "n 3"]
     normals: Float[Tensor, "n 3"] | None = None
@@ -30,6 +31,7 @@ class Displayed(NamedTuple):
     visible: Bool[Tensor, "n"] | None = None
     start: Float[Tensor, "n 3"] | None = None
     near: Float[Tensor, "n"] | None = None
+    rows: Int[Tensor, "n"] | None = None
 
 
 def painted(shown: Displayed, center: Float[Tensor, "3"], eye: Float[Tensor, "3"]) -> Displayed:
@@ -142,12 +144,13 @@ def _displayed(found: Specular, points: Points, center: Float[Tensor, "3"]) -> D
     ray = found.points - center
     near = ray.norm(dim=1, keepdim=True).clamp_min(1e-12)
     direction = ray / near
+    points = points if found.rows is None else points[found.rows]
     length = near + (points - found.points).norm(dim=1, keepdim=True)
     shown = Displayed(center + length * direction, start=found.start, near=near.detach()[:, 0])
     if found.jacobian is None:
         return shown
     normals, stretch = tilted_disks(found.jacobian, -direction.detach())
-    return shown._replace(normals=normals, stretch=stretch, visible=found.visible)
+    return shown._replace(normals=normals, stretch=stretch, visible=found.visible, rows=found.rows)
 
 
 class RevolutionWarp(nn.Module):
@@ -248,10 +251,11 @@ class MovedWarp(nn.Module):
     def forward(self, points: Points, center: Float[Tensor, "3"], start: Points | None = None) -> Displayed:
         old_center = (center - self.shift) @ self.rotation / self.scale
         shown = self.warp(points, old_center, start)
+        stretch = torch.ones_like(shown.positions[:, 0]) if shown.stretch is None else shown.stretch
         return shown._replace(
             positions=self.scale * shown.positions @ self.rotation.T + self.shift,
             normals=None if shown.normals is None else shown.normals @ self.rotation.T,
-            stretch=self.scale**2 * (torch.ones_like(points[:, 0]) if shown.stretch is None else shown.stretch),
+            stretch=self.scale**2 * stretch,
             near=None if shown.near is None else self.scale * shown.near,
         )
 
