@@ -135,8 +135,7 @@ def _means(runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
 def markdown(result: dict[str, Any]) -> str:
     """The comparison as tables for a README: the best number of a column is bold, +- is the deviation over seeds."""
     rows = result["means"]
-    many = len({row["size"] for row in rows}) > 1
-    names = [row["model"] + (f" ({row['size']})" if many else "") for row in rows]
+    names = _labels(rows)
     settings = result["settings"]
     lines = [
         f"{settings['minutes']:g} min of {settings['clock']} time each, {settings['generator_share']:.0%} of it for "
@@ -228,11 +227,11 @@ def chart(rows: list[dict[str, Any]]) -> str:
 def _page(config: RefractReportConfig, result: dict[str, Any]) -> str:
     frames = open_frames(config.data)
     name = escape(f"{frames.card['scene']}: refraction models compared")
+    clock = "processor" if config.clock == "cpu" else "wall-clock"
     facts = (
-        f"{config.minutes:g} min of {config.clock} time each; {config.generator_share:.0%} of it goes to the "
-        f"generator; glassnet gives it all to its renderer, hybrid what its generator does not need. Landing "
-        f"points are {config.coordinates}. "
-        f"{_seeds(config)}."
+        f"{config.minutes:g} minutes of {clock} time each; {config.generator_share:.0%} of it goes to the generator; "
+        f"glassnet gives it all to its renderer, hybrid what its generator does not need. Landing points are "
+        f"{config.coordinates}. {_seeds(config)}."
     )
     header = f'<header><p class="facts">Refraction baking</p><h1>{name}</h1><p class="hint">{facts}</p></header>'
     rows = result["means"]
@@ -263,25 +262,37 @@ def _html_table(heads: list[str], rows: list[list[str]]) -> str:
     return f'<div class="scroll"><table class="views"><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>'
 
 
-def _label(row: dict[str, Any]) -> str:
-    return f"{row['model']}, {row['size']}"
+def _labels(rows: list[dict[str, Any]]) -> list[str]:
+    """Models, with their sizes where there are several."""
+    many = len({row["size"] for row in rows}) > 1
+    return [f"{row['model']} ({row['size']})" if many else row["model"] for row in rows]
 
 
 def _metric_table(rows: list[dict[str, Any]]) -> str:
     keys = [key for key in (*_COLUMNS, "T.FLIP", "FLIP", "LPIPS") if any(key in row["mean"] for row in rows)]
-    return _html_table(["model", *keys], [[_label(row), *(_with_spread(row, key) for key in keys)] for row in rows])
+
+    def cell(row: dict[str, Any], key: str) -> str:
+        mean, *spread = _with_spread(row, key).split(" ", 1)
+        return mean + "".join(f"<small>{part}</small>" for part in spread)
+
+    body = [[name, *(cell(row, key) for key in keys)] for name, row in zip(_labels(rows), rows, strict=True)]
+    return _html_table(["model", *keys], body)
 
 
 def _region_table(rows: list[dict[str, Any]]) -> str:
     names = [name for name in _REGIONS if any(name in row["regions"] for row in rows)]
     heads = [f"{n}<small>{rows[0]['regions'].get(n, {}).get('pixels', 0):,.0f} pixels</small>" for n in names]
-    return _html_table(["model", *heads], [[_label(r), *(_region(r["regions"].get(n)) for n in names)] for r in rows])
+    body = [
+        [label, *(_region(row["regions"].get(n)) for n in names)]
+        for label, row in zip(_labels(rows), rows, strict=True)
+    ]
+    return _html_table(["model", *heads], body)
 
 
 def _speed_table(rows: list[dict[str, Any]]) -> str:
     body = [
-        [_label(row), f"{s['ms']:.1f}", f"{s['parameters']:,.0f}", f"{s['memory']:.0f}", optional(row["mean"]["T.L1"])]
-        for row, s in ((row, row["speed"]) for row in rows)
+        [label, f"{s['ms']:.1f}", f"{s['parameters']:,.0f}", f"{s['memory']:.0f}", optional(row["mean"]["T.L1"])]
+        for label, row, s in ((label, row, row["speed"]) for label, row in zip(_labels(rows), rows, strict=True))
     ]
     return _html_table(["model", "ms a frame", "parameters", "memory (MiB)", "T.L1"], body)
 
