@@ -246,9 +246,7 @@ def _hull_surface(known: Cloud, hull: ConvexHull) -> Surface:
     used, faces = np.unique(hull.simplices, return_inverse=True)
     faces, cloud = faces.reshape(-1, 3), known.at(used)
     outward = hull.equations[:, :3]
-    corners = cloud.points[faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    faces = np.where(((across * outward).sum(-1) < 0)[:, None], faces[:, ::-1], faces)
+    faces = np.where(((_face_normals(cloud.points, faces) * outward).sum(-1) < 0)[:, None], faces[:, ::-1], faces)
     return Surface(cloud.points, faces, _corner_normals(cloud.normals[faces], outward))
 
 
@@ -272,9 +270,13 @@ def _poisson_surface(known: Cloud, cell: float) -> Surface:
     mean = normalize((weight[..., None] * known.normals[nearest]).sum(1))
     vertices = vertices - np.where(own, (weight * offset).sum(-1), 0)[:, None] * mean
     normals = np.where(own[:, None], mean, normals)
-    corners = vertices[faces]
-    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    return Surface(vertices, faces, _corner_normals(normals[faces], normalize(across + 1e-30)))
+    return Surface(vertices, faces, _corner_normals(normals[faces], _face_normals(vertices, faces)))
+
+
+def _face_normals(vertices: Float[np.ndarray, "v 3"], faces: Int[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3"]:
+    """Unit normals of triangles, to the side from which their corners are seen counter-clockwise."""
+    a, b, c = (vertices[corner] for corner in faces.T)
+    return normalize(np.cross(b - a, c - a) + 1e-30)
 
 
 def _corner_normals(normals: Float[np.ndarray, "f 3 3"], faces: Float[np.ndarray, "f 3"]) -> Float[np.ndarray, "f 3 3"]:

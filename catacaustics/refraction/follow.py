@@ -222,7 +222,7 @@ class Tracer(nn.Module):
         stand, slots = self._stand(one, look)
         rays = normalize(_pixels(one.rays)[pixels].astype(float))
         camera = np.broadcast_to(camera_position(one.world_to_clip[0].double().numpy()), rays.shape)
-        shown = _first_hits(one, pixels, slots)
+        shown = _first_hits(one, pixels, camera, slots)
         met = stand.intersect(camera, rays)
         near = (met.body == shown.body) & (np.abs(met.distance - shown.distance) < _ASTRAY)
         first = shown._replace(distance=np.where(near, met.distance, shown.distance))
@@ -276,12 +276,13 @@ def _ends(stand: Stand, found: Landings) -> Ends:
     )
 
 
-def _first_hits(one: Buffers, pixels: Bool[np.ndarray, "h w"], slots: list[int]) -> Hits:
+def _first_hits(
+    one: Buffers, pixels: Bool[np.ndarray, "h w"], camera: Float[np.ndarray, "n 3"], slots: list[int]
+) -> Hits:
     """What G-buffers show of the nearest object."""
     objects = one.objects[0].movedim(1, -1).double().numpy()[:, pixels]
     nearest = np.where(objects[..., 0] > 0, objects[..., 7], np.inf).argmin(0)
     own = np.take_along_axis(objects, nearest[None, :, None], 0)[0]
-    camera = camera_position(one.world_to_clip[0].double().numpy())
     distance = np.linalg.norm(own[:, 1:4] - camera, axis=-1)
     normal = normalize(own[:, 4:7])
     return Hits(distance, normal, normal, np.zeros((len(own), 2)), np.array(slots)[nearest])
