@@ -1,5 +1,7 @@
 """The scene: layers add up, files round trip, bad files are refused."""
 
+from unittest import mock
+
 import numpy as np
 import pytest
 import torch
@@ -8,8 +10,11 @@ from toy import BALL_CENTER, ball_mask, toy_cameras
 from catacaustics.cameras import Viewport
 from catacaustics.config import TrainConfig
 from catacaustics.errors import UserError
+from catacaustics.reflectors.fit import fit_revolution
 from catacaustics.reflectors.volume import build_volume
+from catacaustics.reflectors.warps import RevolutionWarp
 from catacaustics.scene import Scene
+from catacaustics.training import mirrors
 from catacaustics.training.initialize import (
     initial_scene,
     named_reflectors,
@@ -72,6 +77,36 @@ def test_the_environment_does_not_start_from_what_mirrors_show(capture):
     assert mirror.any()
     assert (weights[mirror] == 0).all()
     assert (weights[~mirror] > 0.99).all()
+
+
+def test_a_visual_hull_is_carved_once_however_many_scenes_start_from_it(capture, monkeypatch):
+    carved = mock.Mock(wraps=mirrors.carve_visual_hull)
+    monkeypatch.setattr(mirrors, "carve_visual_hull", carved)
+    volume, rng = build_volume(capture, "ball"), np.random.default_rng(0)
+    for model in ("sphere", "revolution"):
+        reflectors = named_reflectors([volume], (model,))
+        primary_seeds(capture, reflectors, 1000, rng)
+        start_warps(capture, reflectors, TrainConfig(capture.root, capture.root / "run"))
+    assert carved.call_count == 1
+
+
+def test_a_vase_shows_one_point_several_times_and_all_of_its_images_teach_it(capture):
+    scene = build(capture, model=("revolution",), reflection_points=2000)
+    z = np.linspace(-0.5, 0.5, 200)
+    angle = np.random.default_rng(0).uniform(0, 2 * np.pi, 200)
+    radius = 0.2 + 0.1 * np.cos(9 * z)  # two bellies, and a waist
+    points = np.stack([radius * np.cos(angle), radius * np.sin(angle), z], 1)
+    vase, _ = fit_revolution(points, np.zeros(3), np.diag([0.25, 0.25, 0.5]))
+    moved = vase._replace(center=vase.center + torch.from_numpy(BALL_CENTER))
+    scene.warps[0] = RevolutionWarp(type(moved)(*(v.float() for v in moved)))
+    disks = scene.reflection_disks(0, capture.train[0].camera)
+    images = disks.rows.bincount()
+    assert images.max() > 1
+    cloud = scene.reflections[0]
+    assert torch.equal(disks.features, cloud.features[disks.rows])
+    often = images.argmax()
+    (disks.features[disks.rows == often].sum()).backward()
+    assert torch.equal(cloud.features.grad[often], images.max() * torch.ones(len(cloud.features[0])))
 
 
 def test_a_nearer_diffuse_wall_hides_the_reflection(capture):
