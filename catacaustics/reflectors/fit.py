@@ -25,7 +25,7 @@ _THINNEST = 0.1
 """A fitted radius below this share of the largest one is not believed."""
 PROFILE = 24
 """Coefficients of the profile of a surface of revolution."""
-_STIFFNESS = 0.3
+_STIFFNESS = 0.03
 """Of the profile against bends that the points of a visual hull do not ask for."""
 
 

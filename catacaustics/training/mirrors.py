@@ -30,10 +30,10 @@ _BODY_WEIGHT = 0.1
 _BODY_POINTS = 2000
 """Of a visual hull, that bodies are fitted to."""
 
-_ROUND, _TURNED = 0.3, 0.5
+_ROUND, _TURNED = 0.3, 0.3
 """A body is an ellipsoid where its loss (`body_loss`) is below the first; otherwise it is turned where a surface of
 revolution has less than the second's share of that. Losses and shares measured: balls and egg up to 0.17; kettle 0.91,
-0.78; vase 1.15, 0.30; bowl 1.42, 0.07; bent sheet 2.66, 0.36."""
+0.65; vase 1.15, 0.07; bowl 1.42, 0.07; mirror 1.94, 0.71; bent sheet 2.66, 0.45."""
 
 
 def start_shapes(scene: Scene, capture: Capture, config: TrainConfig) -> None:
