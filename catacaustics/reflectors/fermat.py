@@ -70,14 +70,6 @@ def _determinant(matrix: Tensor) -> Tensor:
     return torch.where(value.abs() < floor, torch.where(value < 0, -floor, floor), value)
 
 
-def convex(hessian: Float[Tensor, "n 2 2"]) -> Float[Tensor, "n 2 2"]:
-    """With the diagonal raised until both eigenvalues are positive: Newton's method then goes downhill."""
-    middle = (hessian[:, 0, 0] + hessian[:, 1, 1]) / 2
-    spread = ((hessian[:, 0, 0] - hessian[:, 1, 1]) ** 2 / 4 + hessian[:, 0, 1] ** 2).sqrt()
-    lift = (1e-3 * (middle.abs() + spread) - (middle - spread)).clamp_min(0)
-    return hessian + lift[:, None, None] * torch.eye(2, dtype=hessian.dtype, device=hessian.device)
-
-
 def shortened(step: Tensor, limit: float) -> Tensor:
     return step / (step.norm(dim=1, keepdim=True) / limit).clamp_min(1)
 

@@ -16,7 +16,6 @@ from torch import Tensor
 from catacaustics.reflectors.fermat import (
     Path,
     Specular,
-    convex,
     display_jacobian,
     path_over,
     reflects,
@@ -119,7 +118,7 @@ def specular_points(
         start: what an earlier call returned for the same arguments.
     """
     with torch.no_grad():
-        u = stationary(sources, camera, center, axes, concave) if start is None else start
+        u = _stationary(sources, camera, center, axes, concave) if start is None else start
         basis = tangents(u)
         path = path_over(center + u @ axes.T, sources, camera)
         hessian = _hessian(path, u, basis, axes)
@@ -163,15 +162,14 @@ def distances(
     return (norms - 1) * norms / (scaled @ inverse).norm(dim=1).clamp_min(1e-9)
 
 
-def stationary(
+def _stationary(
     sources: Float[Tensor, "n 3"],
     camera: Float[Tensor, "3"],
     center: Float[Tensor, "3"],
     axes: Float[Tensor, "3 3"],
     concave: bool,
-    steps: int = _ITERATIONS // 2,
 ) -> Float[Tensor, "n 3"]:
-    """Unit vectors u of the stationary points: exact for a sphere, from there by at most `steps` of Newton's method."""
+    """Unit vectors u of the stationary points: exact for a sphere, from there by Newton's method."""
     radii = axes.norm(dim=0)
     v, w = (camera - center).expand_as(sources), sources - center
     dv, dw = v.norm(dim=1), w.norm(dim=1)
@@ -191,16 +189,24 @@ def stationary(
     # Newton's method doubles the digits: the last, differentiated step reaches the rest.
     tolerance = torch.finfo(u.dtype).eps ** 0.6
     active = torch.arange(len(u), device=u.device)
-    for _ in range(steps):
+    for _ in range(_ITERATIONS // 2):
         here = u[active]
         path, basis = path_over(center + here @ axes.T, sources[active], camera), tangents(here)
         gradient = torch.einsum("nij,ni->nj", basis, _gradient(path, axes))
         hessian = _hessian(path, here, basis, axes)
         if not concave:
-            hessian = convex(hessian)  # L has a minimum
+            hessian = _convex(hessian)  # L has a minimum
         step = shortened(solve2(hessian, gradient), _MAX_STEP)
         u[active] = torch.nn.functional.normalize(here - torch.einsum("nij,nj->ni", basis, step), dim=1)
         active = active[step.abs().amax(1) >= tolerance]
         if not len(active):
             break
     return u
+
+
+def _convex(hessian: Float[Tensor, "n 2 2"]) -> Float[Tensor, "n 2 2"]:
+    """With the diagonal raised until both eigenvalues are positive: Newton's method then goes downhill."""
+    middle = (hessian[:, 0, 0] + hessian[:, 1, 1]) / 2
+    spread = ((hessian[:, 0, 0] - hessian[:, 1, 1]) ** 2 / 4 + hessian[:, 0, 1] ** 2).sqrt()
+    lift = (1e-3 * (middle.abs() + spread) - (middle - spread)).clamp_min(0)
+    return hessian + lift[:, None, None] * torch.eye(2, dtype=hessian.dtype, device=hessian.device)

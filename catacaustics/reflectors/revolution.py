@@ -214,7 +214,7 @@ def _images(
         hessian, _ = _lagrangian(path, level, surface.frame[:, 2], multiplier, basis, normal)
         step = solve2(hessian, torch.einsum("nij,ni->nj", basis, uphill))
         step = torch.einsum("nij,nj->ni", basis, shortened(step, _MAX_STEP * size))
-        moved = _onto(surface, here - step, size, 1)
+        moved = _onto(surface, here - step, size)
         x[active] = moved
         active = active[(moved - here).abs().amax(1) >= tolerance]
         if not len(active):
@@ -293,10 +293,8 @@ def _unhidden(
     return free
 
 
-def _onto(surface: Revolution, points: Tensor, size: float, steps: int) -> Tensor:
-    """Towards the surface along its normals, by steps of Newton's method."""
-    for _ in range(steps):
-        level = _level(surface, points)
-        squared = level.gradient.square().sum(1, keepdim=True).clamp_min((1e-3 * size) ** 2)
-        points = points - shortened(level.value[:, None] / squared * level.gradient, _MAX_STEP * size)
-    return points
+def _onto(surface: Revolution, points: Tensor, size: float) -> Tensor:
+    """Towards the surface along its normals, by a step of Newton's method."""
+    level = _level(surface, points)
+    squared = level.gradient.square().sum(1, keepdim=True).clamp_min((1e-3 * size) ** 2)
+    return points - shortened(level.value[:, None] / squared * level.gradient, _MAX_STEP * size)
