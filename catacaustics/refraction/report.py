@@ -201,7 +201,7 @@ def _region(values: dict[str, float] | None) -> str:
 def chart(rows: list[dict[str, Any]]) -> str:
     """T.L1 against milliseconds a frame as SVG: a line a model, a point a size, bars of one deviation over seeds."""
     from matplotlib.figure import Figure
-    from matplotlib.ticker import FuncFormatter
+    from matplotlib.ticker import FuncFormatter, LogLocator
 
     figure = Figure(figsize=(9, 5), layout="constrained")
     axes = figure.add_subplot()
@@ -211,9 +211,12 @@ def chart(rows: list[dict[str, Any]]) -> str:
         bars = axes.errorbar(x, y, [r["spread"]["T.L1"] for r in own], marker="o", markersize=6, capsize=3)
         color = bars.lines[0].get_color()
         for i, row in enumerate(own):
-            text = f"{model} {row['size']}" if i == len(own) - 1 else row["size"]
-            axes.annotate(text, (x[i], y[i]), (8, 5), textcoords="offset points", fontsize=8, color=color)
+            last = i == len(own) - 1  # named beside its point, the others below theirs
+            text, place = (f"{model} {row['size']}", (8, 5)) if last else (row["size"], (0, -14))
+            side = "left" if last else "center"
+            axes.annotate(text, (x[i], y[i]), place, textcoords="offset points", fontsize=8, color=color, ha=side)
     axes.set_xscale("log")
+    axes.xaxis.set_minor_locator(LogLocator(subs=(2, 5)))
     for ticks in (axes.xaxis.set_major_formatter, axes.xaxis.set_minor_formatter):
         ticks(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.set_xlabel("milliseconds a frame")
