@@ -212,7 +212,8 @@ def chart(rows: list[dict[str, Any]]) -> str:
         color = bars.lines[0].get_color()
         for i, row in enumerate(own):
             last = i == len(own) - 1  # named beside its point, the others below theirs
-            text, place = (f"{model} {row['size']}", (8, 5)) if last else (row["size"], (0, -14))
+            name = model if len(own) == 1 else f"{model} {row['size']}"
+            text, place = (name, (8, 5)) if last else (row["size"], (0, -14))
             side = "left" if last else "center"
             axes.annotate(text, (x[i], y[i]), place, textcoords="offset points", fontsize=8, color=color, ha=side)
     axes.set_xscale("log")
@@ -232,9 +233,9 @@ def _page(config: RefractReportConfig, result: dict[str, Any]) -> str:
     name = escape(f"{frames.card['scene']}: refraction models compared")
     clock = "processor" if config.clock == "cpu" else "wall-clock"
     facts = (
-        f"{config.minutes:g} minutes of {clock} time each; {config.generator_share:.0%} of it goes to the generator; "
-        f"glassnet gives it all to its renderer, hybrid what its generator does not need. Landing points are "
-        f"{config.coordinates}. {_seeds(config)}."
+        f"{config.minutes:g} minute{'s' * (config.minutes != 1)} of {clock} time each; "
+        f"{config.generator_share:.0%} of it goes to the generator; glassnet gives it all to its renderer, hybrid what "
+        f"its generator does not need. Landing points are {config.coordinates}. {_seeds(config)}."
     )
     header = f'<header><p class="facts">Refraction baking</p><h1>{name}</h1><p class="hint">{facts}</p></header>'
     rows = result["means"]
