@@ -180,9 +180,10 @@ def _starts(mirror: Mirror, volume: ReflectionVolume, body: Body | None) -> list
     if sheets and body.loss > _ROUND:
         found, sizes = sheets, ()
     else:
-        shape = (t.cpu().numpy().astype(float) for t in (center, axes))
-        found = [fit_body(body.points, *shape, sphere=True) if sphere else (body.center, body.axes)]
-        sizes = _SIZES
+        found, sizes = [(body.center, body.axes)], _SIZES
+        if sphere:
+            shape = (t.cpu().numpy().astype(float) for t in (center, axes))
+            found = [fit_body(body.points, *shape, sphere=True)]
     others = [[torch.from_numpy(c).to(center), torch.from_numpy(a).to(axes), concave] for c, a in found]
     return [[center, size * axes, concave] for size in sizes] + others
 
