@@ -34,8 +34,8 @@ def _splat_self_test(backend: Literal["reference", "cpu", "cuda"]) -> str:
     import torch
 
     from catacaustics.cameras import Camera
+    from catacaustics.kernels import find_library
     from catacaustics.splatting import splat_points
-    from catacaustics.splatting.library import find_library
 
     built, device = "PyTorch", "cpu"
     if backend != "reference":

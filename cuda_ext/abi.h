@@ -11,7 +11,7 @@
 
 namespace catacaustics {
 
-// How a call runs. The layout is repeated in catacaustics/splatting/library.py.
+// How a call runs. The layout is repeated in catacaustics/kernels.py.
 struct Run {
     void* (*allocate)(int64_t bytes);  // null where there is no memory
     int64_t threads;                   // on the CPU
@@ -21,7 +21,7 @@ struct Run {
 };
 
 // Bumped with every change of the ABI.
-constexpr int64_t kAbi = 2;
+constexpr int64_t kAbi = 3;
 
 // Counts are >= 0.
 constexpr int64_t kInvalidValues = -1, kOutOfMemory = -2, kTooLarge = -3, kDeviceError = -4;

@@ -11,9 +11,8 @@ install_import_hook("catacaustics", "beartype.beartype")
 import splatter  # noqa: E402
 from toy import make_toy_capture  # noqa: E402
 
-from catacaustics import splatting  # noqa: E402
+from catacaustics import kernels  # noqa: E402
 from catacaustics.capture.dataset import open_capture  # noqa: E402
-from catacaustics.splatting import library  # noqa: E402
 
 
 def pytest_addoption(parser):
@@ -49,11 +48,10 @@ def backend(request, monkeypatch):
         pytest.fail(f"no {name} backend: {problem}")
     if problem:
         pytest.skip(f"no {name} backend: {problem}")
-    monkeypatch.setenv("CATACAUSTICS_SPLATTER", "cpu" if name == "emulated" else name)
+    monkeypatch.setenv("CATACAUSTICS_BACKEND", "cpu" if name == "emulated" else name)
     monkeypatch.setattr(splatter.device, "backend", name)
     if name == "cuda":
         monkeypatch.setattr(splatter.device, "name", "cuda")
     if name == "emulated":
-        for module in (splatting, library):
-            monkeypatch.setattr(module, "find_library", lambda _: splatter.emulated_library())
+        monkeypatch.setattr(kernels, "find_library", lambda _: splatter.emulated_library())
     return name

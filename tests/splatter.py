@@ -10,7 +10,7 @@ from pathlib import Path
 import torch
 
 from catacaustics import splatting
-from catacaustics.splatting.library import Found, NativeError, find_library, load_library
+from catacaustics.kernels import Found, NativeError, find_library, load_library
 
 BACKENDS = ("reference", "cpu", "cuda", "emulated")
 KERNELS = Path(__file__).parent.parent / "cuda_ext"

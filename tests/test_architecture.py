@@ -16,6 +16,7 @@ FLOORS = [
     "shapes",
     "errors",
     "config",
+    "kernels",
     "files",
     "geometry",
     "cameras",

@@ -13,9 +13,9 @@ from splatter import KERNELS, emulated_library, splat_points
 from test_native import results
 from test_splatting import front_camera, random_scene
 
+from catacaustics import kernels
 from catacaustics.cameras import Viewport
 from catacaustics.config import SplatConfig
-from catacaustics.splatting import library
 
 NVCC = shutil.which("nvcc") or shutil.which("/usr/local/cuda/bin/nvcc")
 
@@ -26,7 +26,7 @@ def emulated(monkeypatch):
     found = emulated_library()
     if found.problem:
         pytest.skip(found.problem)
-    monkeypatch.setattr(library, "find_library", lambda _: found)
+    monkeypatch.setattr(kernels, "find_library", lambda _: found)
     return found.library
 
 
@@ -81,9 +81,9 @@ def test_a_build_that_fails_leaves_its_reason_for_doctor_and_lets_the_other_libr
     defined = [f"-D{name}={path}" for name, path in places.items()]
     subprocess.run(["cmake", *defined, "-P", str(KERNELS / "cuda" / "build.cmake")], check=True, capture_output=True)
     assert places["stamp"].exists()
-    monkeypatch.setattr(library, "_folders", lambda: [folder])
+    monkeypatch.setattr(kernels, "_folders", lambda: [folder])
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    problem = library.find_library.__wrapped__("cuda").problem
+    problem = kernels.find_library.__wrapped__("cuda").problem
     assert problem == "it could not be built: nvcc fatal : Unsupported gpu architecture"
 
 

@@ -4,7 +4,7 @@ import pytest
 
 from catacaustics.config import DoctorConfig
 from catacaustics.doctor import doctor
-from catacaustics.splatting.library import find_library
+from catacaustics.kernels import find_library
 
 
 @pytest.fixture

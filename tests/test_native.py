@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 from splatter import splat_points
 from test_splatting import NAMES, front_camera, random_scene, weighted_sum
 
-import catacaustics.splatting as splatting
+from catacaustics import kernels
 from catacaustics.cameras import Camera, Viewport
 from catacaustics.config import SplatConfig
 from catacaustics.errors import UserError
-from catacaustics.splatting import library, native, reference
-from catacaustics.splatting.library import NativeError, find_library, load_library
+from catacaustics.kernels import NativeError, find_library, load_library
+from catacaustics.splatting import native, reference
 
 # Largest difference from the reference in float64, as a share of the largest value of each result.
 TOLERANCE = {torch.float32: 3e-5, torch.float64: 1e-12}
@@ -486,7 +486,7 @@ def test_every_variant_that_this_processor_runs_gives_the_same(monkeypatch):
             assert "needs instructions that this processor lacks" in str(error)  # noqa: PT017
             continue
         tried += 1
-        monkeypatch.setattr(library, "find_library", lambda _, variant=variant: library.Found(variant, ""))
+        monkeypatch.setattr(kernels, "find_library", lambda _, variant=variant: kernels.Found(variant, ""))
         for name, value in results(scene, camera, None, WIDE, "cpu").items():
             largest = float(best[name].abs().max())
             torch.testing.assert_close(value, best[name], rtol=0, atol=TOLERANCE[torch.float32] * largest)
@@ -540,7 +540,7 @@ def test_another_library_is_refused_and_the_best_of_several_is_taken(tmp_path, m
         (folder / installed.name).write_bytes(installed.read_bytes())
     best = find_library("cpu").library.path.name  # the first that is tried
     (folder / best).write_bytes((folder / best).read_bytes()[:5000])
-    monkeypatch.setattr(library, "_folders", lambda: [folder])
+    monkeypatch.setattr(kernels, "_folders", lambda: [folder])
     found = find_library.__wrapped__("cpu")
     if found.library is None:
         assert found.problem == f"{best} is cut short"
@@ -549,20 +549,20 @@ def test_another_library_is_refused_and_the_best_of_several_is_taken(tmp_path, m
 
 
 def test_without_a_library_the_reference_takes_over_and_says_so_once(monkeypatch, caplog):
-    monkeypatch.setattr(splatting, "find_library", lambda _: library.Found(None, "it was never built"))
-    splatting._say_once.cache_clear()
-    monkeypatch.setenv("CATACAUSTICS_SPLATTER", "auto")
+    monkeypatch.setattr(kernels, "find_library", lambda _: kernels.Found(None, "it was never built"))
+    kernels._say_once.cache_clear()
+    monkeypatch.setenv("CATACAUSTICS_BACKEND", "auto")
     for _ in range(3):
         splat_points(*random_scene(5), front_camera())
     assert [r.getMessage() for r in caplog.records].count(
-        "splatting in PyTorch, which is many times slower than native code: it was never built"
+        "computing in PyTorch, which is many times slower than native code: it was never built"
     ) == 1
-    splatting._say_once.cache_clear()
+    kernels._say_once.cache_clear()
     with pytest.raises(UserError, match="it was never built"):
         splat_points(*random_scene(5), front_camera(), backend="cpu")
 
 
 def test_an_unknown_backend_is_refused_by_name(monkeypatch):
-    monkeypatch.setenv("CATACAUSTICS_SPLATTER", "cdua")
+    monkeypatch.setenv("CATACAUSTICS_BACKEND", "cdua")
     with pytest.raises(UserError, match="'cdua'"):
         splat_points(*random_scene(5), front_camera())

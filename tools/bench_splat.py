@@ -30,8 +30,8 @@ from torch import Tensor
 
 from catacaustics.cameras import Camera
 from catacaustics.config import SplatConfig
+from catacaustics.kernels import find_library
 from catacaustics.splatting import Backend, reference, splat_points
-from catacaustics.splatting.library import find_library
 from catacaustics.splatting.reference import Disks
 
 SIZES = {"20k": (20_000, 320, 213), "200k": (200_000, 1000, 666), "1M": (1_000_000, 1000, 666)}

@@ -1,63 +1,15 @@
 """EWA splatting of oriented disks: one entry, several backends that compute the same."""
 
-import functools
-import logging
-import os
-from typing import Literal, get_args
-
-import torch
 from torch import Tensor
 
 from catacaustics.cameras import Camera, Viewport
 from catacaustics.config import SplatConfig
-from catacaustics.errors import UserError
+from catacaustics.kernels import Backend, backend_for
 from catacaustics.shapes import Float
 from catacaustics.splatting import native, reference
-from catacaustics.splatting.library import find_library
 from catacaustics.splatting.reference import Disks, SplatOutput, check_shapes, points_in_view
 
 __all__ = ["Backend", "SplatOutput", "backend_for", "points_in_view", "splat_points"]
-
-Backend = Literal["auto", "reference", "cpu", "cuda"]
-_CHOICE = "CATACAUSTICS_SPLATTER"
-
-
-@functools.cache
-def _say_once(message: str) -> None:
-    logging.getLogger("catacaustics").warning(message)
-
-
-@torch.compiler.assume_constant_result
-def backend_for(device: str, backend: Backend | None = None) -> str:
-    """The backend that splats tensors of a device: `cpu`, `cuda` (native code) or `reference` (PyTorch).
-
-    Args:
-        device: "cpu" or "cuda".
-        backend: which one to take; None asks the environment variable CATACAUSTICS_SPLATTER. auto takes the fastest
-            there is, and says so once where that is the reference.
-
-    Raises:
-        UserError: no such backend, or it does not run here.
-    """
-    choice = backend or os.environ.get(_CHOICE) or "auto"
-    if choice not in get_args(Backend):
-        known = ", ".join(get_args(Backend))
-        raise UserError(f"splatter backend {choice!r}", known, f"check {_CHOICE} in the environment")
-    if choice == "reference":
-        return "reference"
-    if choice not in ("auto", device):
-        raise UserError(f"splatter backend {choice} for tensors on {device}", f"{device} or auto", "use backend auto")
-    problem = find_library(device).problem if device in ("cpu", "cuda") else f"there is none for {device}"
-    if not problem:
-        return device
-    if choice == device:
-        raise UserError(
-            f"no native splatter: {problem}",
-            "the libraries that the build installs into catacaustics/_native",
-            "use backend auto, or install again with the compiler; `catacaustics doctor` shows what there is",
-        )
-    _say_once(f"splatting in PyTorch, which is many times slower than native code: {problem}")
-    return "reference"
 
 
 def splat_points(

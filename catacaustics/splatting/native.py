@@ -15,7 +15,7 @@ from torch import Tensor
 
 from catacaustics.cameras import Camera, Viewport
 from catacaustics.config import SplatConfig
-from catacaustics.splatting.library import INVALID_VALUES, library_for
+from catacaustics.kernels import INVALID_VALUES, library_for
 from catacaustics.splatting.reference import Disks, SplatOutput, check_values
 
 _RECORD = 8  # values of a record

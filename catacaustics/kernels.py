@@ -1,4 +1,4 @@
-"""Native libraries of the splatter: found, checked, loaded with ctypes and called.
+"""Native kernels: libraries found, checked, loaded with ctypes and called.
 
 `cuda_ext/` builds one library for each level of x86-64 (one plain library elsewhere), and one for NVIDIA's GPUs where
 there is a CUDA compiler, into `catacaustics/_native`. All have the C ABI of `cuda_ext/abi.h`. A library that is
@@ -9,18 +9,25 @@ process.
 import contextlib
 import ctypes
 import functools
+import logging
+import os
 import struct
 import sys
 import sysconfig
+from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor
 
 import catacaustics
+from catacaustics.errors import UserError
 
-_ABI = 2
+Backend = Literal["auto", "reference", "cpu", "cuda"]
+_CHOICE = "CATACAUSTICS_BACKEND"
+
+_ABI = 3
 INVALID_VALUES = -1
 _OUT_OF_MEMORY, _TOO_LARGE = -2, -3
 # Best first.
@@ -30,6 +37,7 @@ _NAMES = {
 }
 _ALLOCATE = ctypes.CFUNCTYPE(ctypes.c_void_p, ctypes.c_int64)
 _P, _I, _D = ctypes.c_void_p, ctypes.c_int64, ctypes.c_double
+# Of the splatter, in every library.
 _SIGNATURES = {
     "project": [_P, _I, *[_P] * 6, *[_I] * 4, *[_D] * 8, *[_P] * 3],
     "project_backward": [_P, _I, *[_P] * 5, _D, _I, _P, *[_P] * 7],
@@ -38,6 +46,8 @@ _SIGNATURES = {
     "blend_backward": [_P, _I, _I, *[_P] * 5, *[_I] * 4, _D, *[_P] * 6],
     "finite": [_P, _P, _I],
 }
+# In the CPU's libraries alone: PyTorch does these on a GPU.
+_HOST_SIGNATURES: dict[str, list] = {}
 
 
 class NativeError(Exception):
@@ -129,7 +139,8 @@ def load_library(path: Path) -> NativeLibrary:
         description, problem = handle.catacaustics_description().decode(), handle.catacaustics_problem().decode()
         if problem:
             raise NativeError(f"{path.name} ({description}): {problem}")
-        for name, arguments in _SIGNATURES.items():
+        host = path.stem.startswith("libcatacaustics_cpu")
+        for name, arguments in (_SIGNATURES | (_HOST_SIGNATURES if host else {})).items():
             for suffix in ("f32", "f64"):
                 function = getattr(handle, f"catacaustics_{name}_{suffix}")
                 function.restype, function.argtypes = ctypes.c_int64, arguments
@@ -226,3 +237,52 @@ def library_for(tensor: Tensor) -> NativeLibrary:
     if library is None:
         raise NativeError(f"no native splatter: {problem}")
     return library
+
+
+@functools.cache
+def _say_once(message: str) -> None:
+    logging.getLogger("catacaustics").warning(message)
+
+
+@torch.compiler.assume_constant_result
+def backend_for(device: str, backend: Backend | None = None) -> str:
+    """The backend that computes with tensors of a device: `cpu`, `cuda` (native code) or `reference` (PyTorch).
+
+    Args:
+        device: "cpu" or "cuda".
+        backend: which one to take; None asks the environment variable CATACAUSTICS_SPLATTER. auto takes the fastest
+            there is, and says so once where that is the reference.
+
+    Raises:
+        UserError: no such backend, or it does not run here.
+    """
+    choice = backend or os.environ.get(_CHOICE) or "auto"
+    if choice not in get_args(Backend):
+        known = ", ".join(get_args(Backend))
+        raise UserError(f"backend {choice!r}", known, f"check {_CHOICE} in the environment")
+    if choice == "reference":
+        return "reference"
+    if choice not in ("auto", device):
+        raise UserError(f"backend {choice} for tensors on {device}", f"{device} or auto", "use backend auto")
+    problem = find_library(device).problem if device in ("cpu", "cuda") else f"there is none for {device}"
+    if not problem:
+        return device
+    if choice == device:
+        raise UserError(
+            f"no native kernels: {problem}",
+            "the libraries that the build installs into catacaustics/_native",
+            "use backend auto, or install again with the compiler; `catacaustics doctor` shows what there is",
+        )
+    _say_once(f"computing in PyTorch, which is many times slower than native code: {problem}")
+    return "reference"
+
+
+def host_kernel(name: str, tensor: Tensor) -> Callable[..., tuple[int, list[Tensor]]] | None:
+    """A kernel that only the CPU's libraries have, to be called with its arguments after `like`; None where PyTorch is
+    to compute instead: on other devices, for other types, without a library, and by choice (see `backend_for`)."""
+    if tensor.device.type != "cpu" or tensor.dtype not in (torch.float32, torch.float64):
+        return None
+    library = find_library("cpu").library if backend_for("cpu") == "cpu" else None
+    if library is None or not hasattr(library.handle, f"catacaustics_{name}_f32"):
+        return None
+    return functools.partial(library.call, name, tensor)
