@@ -47,7 +47,11 @@ _SIGNATURES = {
     "finite": [_P, _P, _I],
 }
 # In the CPU's libraries alone: PyTorch does these on a GPU.
-_HOST_SIGNATURES: dict[str, list] = {}
+_HOST_SIGNATURES = {
+    "quadric_images": [_P, _I, *[_P] * 4, _I, _I, *[_P] * 6],
+    "quadric_positions": [_P, _I, *[_P] * 7],
+    "quadric_backward": [_P, _I, *[_P] * 8],
+}
 
 
 class NativeError(Exception):

@@ -118,7 +118,7 @@ def specular_points(
         start: what an earlier call returned for the same arguments.
     """
     with torch.no_grad():
-        u = _stationary(sources, camera, center, axes, concave) if start is None else start
+        u = stationary(sources, camera, center, axes, concave) if start is None else start
         basis = tangents(u)
         path = path_over(center + u @ axes.T, sources, camera)
         hessian = _hessian(path, u, basis, axes)
@@ -162,7 +162,7 @@ def distances(
     return (norms - 1) * norms / (scaled @ inverse).norm(dim=1).clamp_min(1e-9)
 
 
-def _stationary(
+def stationary(
     sources: Float[Tensor, "n 3"],
     camera: Float[Tensor, "3"],
     center: Float[Tensor, "3"],
@@ -186,19 +186,39 @@ def _stationary(
     u = sign * torch.nn.functional.normalize(normal @ axes, dim=1)
     if float(radii.max() - radii.min()) <= 1e-6 * float(radii.max()):
         return u
-    # Newton's method doubles the digits: the last, differentiated step reaches the rest.
-    tolerance = torch.finfo(u.dtype).eps ** 0.6
+    return _newton(u, sources, camera, center, axes, concave)
+
+
+def _newton(
+    u: Float[Tensor, "n 3"],
+    sources: Float[Tensor, "n 3"],
+    camera: Float[Tensor, "3"],
+    center: Float[Tensor, "3"],
+    axes: Float[Tensor, "3 3"],
+    concave: bool,
+) -> Float[Tensor, "n 3"]:
+    """From u by Newton's method. On a convex mirror L has a minimum: a step that makes the path longer is taken back,
+    and cut to a quarter; where a source is near the mirror, L is no parabola."""
+    # The digits double: the last, differentiated step reaches the rest.
+    eps = torch.finfo(u.dtype).eps
     active = torch.arange(len(u), device=u.device)
+    here, best, move = u, u.clone(), torch.zeros_like(u)
+    least = torch.full_like(u[:, 0], torch.inf)
     for _ in range(_ITERATIONS // 2):
-        here = u[active]
         path, basis = path_over(center + here @ axes.T, sources[active], camera), tangents(here)
         gradient = torch.einsum("nij,ni->nj", basis, _gradient(path, axes))
         hessian = _hessian(path, here, basis, axes)
-        if not concave:
-            hessian = _convex(hessian)  # L has a minimum
-        step = shortened(solve2(hessian, gradient), _MAX_STEP)
-        u[active] = torch.nn.functional.normalize(here - torch.einsum("nij,nj->ni", basis, step), dim=1)
-        active = active[step.abs().amax(1) >= tolerance]
+        step = solve2(hessian if concave else _convex(hessian), gradient)
+        following = torch.einsum("nij,nj->ni", basis, shortened(step, _MAX_STEP))
+        total = (path.camera_distance + path.source_distance)[:, 0]
+        better = (total <= least * (1 + 8 * eps)) | concave
+        least = torch.where(better, total, least)
+        best = torch.where(better[:, None], here, best)
+        move = torch.where(better[:, None], following, move / 4)
+        here = torch.nn.functional.normalize(best - move, dim=1)
+        u[active] = here
+        going = move.norm(dim=1) >= eps**0.6
+        active, here, best, move, least = (t[going] for t in (active, here, best, move, least))
         if not len(active):
             break
     return u

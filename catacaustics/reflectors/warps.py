@@ -11,7 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor, nn
 
-from catacaustics.reflectors import quadric, revolution
+from catacaustics.reflectors import native, quadric, revolution
 from catacaustics.reflectors.fermat import Specular, tilted_disks
 from catacaustics.reflectors.revolution import Revolution
 from catacaustics.shapes import Bool, Float, Int
@@ -135,8 +135,11 @@ class QuadricWarp(nn.Module):
         return center, axes
 
     def forward(self, points: Points, center: Float[Tensor, "3"], start: Points | None = None) -> Displayed:
-        found = quadric.specular_points(points, center, *self.shape(), bool(self.concave), start)
-        return _displayed(found, points, center)
+        shape, concave = self.shape(), bool(self.concave)
+        images = native.quadric_images(points, center, *shape, concave, start)
+        if images is not None:
+            return Displayed(**images._asdict())
+        return _displayed(quadric.specular_points(points, center, *shape, concave, start), points, center)
 
 
 def _displayed(found: Specular, points: Points, center: Float[Tensor, "3"]) -> Displayed:

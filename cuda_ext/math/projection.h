@@ -1,24 +1,9 @@
 // Projection of an oriented disk (see catacaustics/splatting/reference.py for the equations) and its derivative.
 #pragma once
 
-#include "common.h"
+#include "vector.h"
 
 namespace catacaustics {
-
-template <class T>
-struct Vec3 {
-    T x, y, z;
-};
-
-template <class T>
-CATACAUSTICS_HD Vec3<T> operator+(Vec3<T> a, Vec3<T> b) {
-    return {a.x + b.x, a.y + b.y, a.z + b.z};
-}
-
-template <class T>
-CATACAUSTICS_HD T dot(Vec3<T> a, Vec3<T> b) {
-    return a.x * b.x + a.y * b.y + a.z * b.z;
-}
 
 // camera_from_world as three rows and a translation, and the lens in pixels.
 template <class T>
