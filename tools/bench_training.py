@@ -1,0 +1,113 @@
+"""Time steps of a training, and a rendered view, with native kernels and without.
+
+    native              all kernels that this machine has
+    PyTorch splatter    the splatter in PyTorch, all else native
+    PyTorch             everything in PyTorch, as where there is no compiler
+
+A finished run is trained on, in a copy, from its last checkpoint: full resolution, all points. The variants take turns,
+step by step, in one process; times are medians.
+
+    python tools/bench_training.py demo/run --json bench.json
+"""
+
+import argparse
+import functools
+import json
+import os
+import shutil
+import statistics
+import tempfile
+import time
+from dataclasses import fields
+from pathlib import Path
+
+import torch
+
+from catacaustics import scene as scenes
+from catacaustics.config import TrainConfig
+from catacaustics.kernels import find_library
+from catacaustics.reflectors.volume import build_volume
+from catacaustics.run import open_run
+from catacaustics.scene import Scene
+from catacaustics.splatting import splat_points
+from catacaustics.training.initialize import named_reflectors
+from catacaustics.training.loop import fit
+from catacaustics.training.photographs import scaled_camera
+
+VARIANTS = ("native", "PyTorch splatter", "PyTorch")
+
+
+def choose(variant: str) -> None:
+    """From now on, compute in this way."""
+    os.environ["CATACAUSTICS_BACKEND"] = "reference" if variant == "PyTorch" else "auto"
+    in_pytorch = functools.partial(splat_points, backend="reference")
+    scenes.splat_points = splat_points if variant == "native" else in_pytorch
+
+
+def step_times(run: Path, copy: Path, steps: int) -> tuple[dict[str, list[float]], Scene, TrainConfig]:
+    """Seconds of steps by variant, after every photograph has been read once; the scene, and the settings."""
+    opened = open_run(run)
+    shutil.copy(run / "checkpoint.safetensors", copy / "checkpoint.safetensors")
+    known = {f.name for f in fields(TrainConfig)}
+    settings = {k: v for k, v in opened.config.items() if k in known}
+    warm = len(opened.capture.train) + 10
+    done = json.loads((run / "metrics.jsonl").read_text().splitlines()[-1])["step"]
+    last = done + warm + len(VARIANTS) * steps + 10
+    # Densification belongs to no variant.
+    changes = {"run": copy, "resume": True, "minutes": None, "iterations": last, "densifications": 0}
+    config = TrainConfig(**(settings | changes | {"model": tuple(settings["model"])}))
+    times: dict[str, list[float]] = {variant: [] for variant in VARIANTS}
+    state = {"step": 0, "before": 0.0}
+
+    def watch(_: Scene) -> None:
+        now, index = time.perf_counter(), state["step"] - warm
+        if index > 0:
+            times[VARIANTS[(index - 1) % len(VARIANTS)]].append(now - state["before"])
+        choose(VARIANTS[max(index, 0) % len(VARIANTS)])
+        state["step"] += 1
+        state["before"] = time.perf_counter()
+
+    volumes = [build_volume(opened.capture, name) for name in opened.capture.reflectors]
+    return times, fit(opened.capture, named_reflectors(volumes, config.model), config, watch=watch), config
+
+
+def render_times(scene: Scene, run: Path, image_size: int, runs: int) -> dict[str, list[float]]:
+    view = open_run(run).capture.held_out[0]
+    camera = scaled_camera(view.camera, image_size, 1.0)
+    times: dict[str, list[float]] = {variant: [] for variant in VARIANTS}
+    for turn in range(runs + 1):
+        for variant in VARIANTS:
+            choose(variant)
+            start = time.perf_counter()
+            scene.render(camera)
+            if turn:
+                times[variant].append(time.perf_counter() - start)
+    return times
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("run", type=Path, help="folder of a finished run")
+    parser.add_argument("--steps", type=int, default=40, help="of each variant")
+    parser.add_argument("--threads", type=int, default=torch.get_num_threads())
+    parser.add_argument("--json", type=Path, help="file to write all figures to")
+    options = parser.parse_args()
+    torch.set_num_threads(options.threads)
+    found = find_library("cpu")
+    header = {"threads": options.threads, "cpu": found.library.description if found.library else found.problem}
+    with tempfile.TemporaryDirectory() as folder:
+        steps, scene, config = step_times(options.run, Path(folder), options.steps)
+    renders = render_times(scene, options.run, config.image_size, 5)
+    results = {}
+    for name, times in (("step", steps), ("view", renders)):
+        medians = {variant: statistics.median(values) for variant, values in times.items()}
+        results[name] = medians
+        for variant, value in medians.items():
+            ratio = value / medians["native"]
+            print(f"{name:<5} {variant:<17} {1000 * value:8.1f} ms  {ratio:5.2f} times native")
+    if options.json:
+        options.json.write_text(json.dumps({**header, **results}))
+
+
+if __name__ == "__main__":
+    main()
