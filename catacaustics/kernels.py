@@ -47,7 +47,9 @@ _SIGNATURES = {
     "finite": [_P, _P, _I],
 }
 # In the CPU's libraries alone: PyTorch does these on a GPU.
-_HOST_SIGNATURES: dict[str, list] = {}
+_HOST_SIGNATURES: dict[str, list] = {
+    "adam": [_P, _I, _I, _P, _P, *[_D] * 5, *[_P] * 4],
+}
 
 
 class NativeError(Exception):
