@@ -49,6 +49,9 @@ _SIGNATURES = {
 # In the CPU's libraries alone: PyTorch does these on a GPU.
 _HOST_SIGNATURES: dict[str, list] = {
     "adam": [_P, _I, _I, _P, _P, *[_D] * 5, *[_P] * 4],
+    "cull": [_P, _I, *[_P] * 4, *[_I] * 4, *[_D] * 7, _P],
+    "environment": [_P, _I, *[_I] * 3, *[_P] * 4],
+    "environment_backward": [_P, _I, *[_I] * 3, *[_P] * 7],
 }
 
 

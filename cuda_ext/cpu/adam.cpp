@@ -77,20 +77,18 @@ void step_values(const Parameter<S>& p, const Rates& rates, S rate, int64_t begi
         adam_step(rates.settings<S>(), rate, p.gradient[i], p.value[i], p.mean[i], p.square[i]);
 }
 
-// Lists the rows of [begin, end) that have a gradient.
-template <class S>
-int list_rows(const Parameter<S>& p, const float* steps, int64_t width, int64_t begin, int64_t end, int64_t* rows) {
+// Lists the rows of [begin, end) that have a gradient; known_width is 0, or the width. No branch on a row: which ones
+// have a gradient cannot be foreseen.
+template <int known_width, class S>
+int list_rows(const S* gradient, int64_t some_width, int64_t begin, int64_t end, int64_t* rows) {
+    const int64_t width = known_width ? known_width : some_width;
     int count = 0;
     for (int64_t first = begin; first < end; first += kBlock) {
         const int64_t last = std::min(first + kBlock, end);
-        if (!any_set(p.gradient + first * width, (last - first) * width)) continue;
+        if (!any_set(gradient + first * width, (last - first) * width)) continue;
         for (int64_t row = first; row < last; ++row) {
-            if (!any_set(p.gradient + row * width, width)) continue;
-            __builtin_prefetch(p.value + row * width, 1);
-            __builtin_prefetch(p.mean + row * width, 1);
-            __builtin_prefetch(p.square + row * width, 1);
-            __builtin_prefetch(steps + row, 1);
-            rows[count++] = row;
+            rows[count] = row;
+            count += any_set(gradient + row * width, width);
         }
     }
     return count;
@@ -106,6 +104,15 @@ void step_rows(
     alignas(64) S scale[P::size], first[P::size], second[P::size];
     alignas(64) S gradient[P::size], value[P::size], mean[P::size], square[P::size];
     for (int k = 0; k < count; k += P::size) {
+        for (int ahead = k + 2 * P::size; ahead < std::min(count, k + 3 * P::size); ++ahead) {
+            const int64_t from = rows[ahead] * width;
+            const S* const arrays[4] = {p.gradient, p.value, p.mean, p.square};
+            for (const S* values : arrays) {
+                __builtin_prefetch(values + from, 1);
+                if (width > 1) __builtin_prefetch(values + from + width - 1, 1);  // mostly the same cache line
+            }
+            __builtin_prefetch(steps + rows[ahead], 1);
+        }
         const int here = std::min<int>(P::size, count - k);
         int64_t from[P::size];
         for (int lane = 0; lane < P::size; ++lane) {
@@ -155,9 +162,14 @@ int64_t adam(
         return 0;
     }
     const Powers power1(rates.beta1), power2(rates.beta2);
+    const auto list = width == 1   ? list_rows<1, S>
+                      : width == 3 ? list_rows<3, S>
+                      : width == 6 ? list_rows<6, S>
+                                   : list_rows<0, S>;
     parallel_for(threads, chunks, [&](int64_t chunk) {
-        int64_t rows[kChunk];
-        const int seen = list_rows(p, steps, width, chunk * kChunk, std::min(items, (chunk + 1) * kChunk), rows);
+        int64_t rows[kChunk + 1];  // the place after the last is written to
+        const int64_t begin = chunk * kChunk, end = std::min(items, begin + kChunk);
+        const int seen = list(p.gradient, width, begin, end, rows);
         step_rows(p, steps, row_rates, rates, power1, power2, width, rows, seen);
     });
     return 0;
