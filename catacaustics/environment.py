@@ -4,7 +4,9 @@ import math
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
+from catacaustics.kernels import host_kernel
 from catacaustics.renderer import FEATURES
 from catacaustics.shapes import Float, Int
 
@@ -57,19 +59,55 @@ class EnvironmentMap(nn.Module):
 
     def forward(self, directions: Float[Tensor, "height width 3"]) -> Float[Tensor, "height width 6"]:
         """Bilinear lookup for unit world directions; longitude wraps around."""
-        x, y, z = (directions.flatten(0, 1) @ self.axes.T).unbind(1)
+        x, y, z = self.axes @ directions.flatten(0, 1).T
         height, width, channels = self.features.shape
         column = (torch.atan2(x, z) / math.pi + 1) / 2 * width - 0.5
-        row = ((torch.asin(y.clamp(-1, 1)) / (math.pi / 2) + 1) / 2 * height - 0.5).clamp(0, height - 1)
-        left, top = column.detach().floor(), row.detach().floor()
-        right_share, lower_share = column - left, row - top
-        columns = torch.stack([left, left + 1], 1).long() % width
-        rows = torch.stack([top, top + 1], 1).long().clamp(max=height - 1)
-        shares = (
-            torch.stack([1 - lower_share, lower_share], 1)[:, :, None]
-            * torch.stack([1 - right_share, right_share], 1)[:, None, :]
-        )
-        texel = rows[:, :, None] * width + columns[:, None, :]
-        # Reads rows of the table: a map of its size is never copied.
-        found = self.features.view(-1, channels).index_select(0, texel.flatten()).view(-1, 4, channels)
-        return (shares.view(-1, 4, 1) * found).sum(1).view(*directions.shape[:2], channels)
+        # Not up to the poles, where the arc sine has no derivative: the outermost row ends half a texel before.
+        latitude = torch.asin(y.clamp(-1 + 1e-7, 1 - 1e-7))
+        row = ((latitude / (math.pi / 2) + 1) / 2 * height - 0.5).clamp(0, height - 1)
+        native = host_kernel("environment", self.features) and row.dtype == self.features.dtype
+        found = _NativeLookup.apply(self.features, row, column) if native else _lookup(self.features, row, column)
+        return found.view(*directions.shape[:2], channels)
+
+
+def _lookup(
+    features: Float[Tensor, "height width channels"], row: Float[Tensor, "n"], column: Float[Tensor, "n"]
+) -> Float[Tensor, "n channels"]:
+    """Bilinear lookup at fractional rows in [0, height - 1] and columns, which wrap around."""
+    height, width, channels = features.shape
+    left, top = column.detach().floor(), row.detach().floor()
+    right_share, lower_share = column - left, row - top
+    columns = torch.stack([left, left + 1], 1).long() % width
+    rows = torch.stack([top, top + 1], 1).long().clamp(max=height - 1)
+    shares = (
+        torch.stack([1 - lower_share, lower_share], 1)[:, :, None]
+        * torch.stack([1 - right_share, right_share], 1)[:, None, :]
+    )
+    texel = rows[:, :, None] * width + columns[:, None, :]
+    # Reads rows of the table: a map of its size is never copied.
+    found = features.view(-1, channels).index_select(0, texel.flatten()).view(-1, 4, channels)
+    return (shares.view(-1, 4, 1) * found).sum(1)
+
+
+class _NativeLookup(torch.autograd.Function):
+    """`_lookup` in native code; gradients are the same bit for bit in every run."""
+
+    @staticmethod
+    def forward(ctx, features, row, column):
+        features, row, column = (t.contiguous() for t in (features, row, column))
+        ctx.save_for_backward(features, row, column)
+        found = features.new_empty(len(row), features.shape[2])
+        host_kernel("environment", features)(len(row), *features.shape, features, row, column, found)
+        return found
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, g_found):  # pyright: ignore[reportIncompatibleMethodOverride]
+        gradients = [
+            torch.empty_like(t) if wanted else None
+            for t, wanted in zip(ctx.saved_tensors, ctx.needs_input_grad, strict=True)
+        ]
+        kernel = host_kernel("environment_backward", g_found)
+        features, row, _ = ctx.saved_tensors
+        kernel(len(row), *features.shape, *ctx.saved_tensors, g_found.contiguous(), *gradients)
+        return tuple(gradients)

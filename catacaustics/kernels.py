@@ -48,6 +48,10 @@ _SIGNATURES = {
 }
 # In the CPU's libraries alone: PyTorch does these on a GPU.
 _HOST_SIGNATURES = {
+    "adam": [_P, _I, _I, _P, _P, *[_D] * 5, *[_P] * 4],
+    "cull": [_P, _I, *[_P] * 4, *[_I] * 4, *[_D] * 7, _P],
+    "environment": [_P, _I, *[_I] * 3, *[_P] * 4],
+    "environment_backward": [_P, _I, *[_I] * 3, *[_P] * 7],
     "quadric_images": [_P, _I, *[_P] * 4, _I, _I, *[_P] * 6],
     "quadric_positions": [_P, _I, *[_P] * 7],
     "quadric_backward": [_P, _I, *[_P] * 8],

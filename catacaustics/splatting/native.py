@@ -16,7 +16,7 @@ from torch import Tensor
 from catacaustics.cameras import Camera, Viewport
 from catacaustics.config import SplatConfig
 from catacaustics.kernels import INVALID_VALUES, library_for
-from catacaustics.splatting.reference import Disks, SplatOutput, check_values
+from catacaustics.splatting.reference import Disks, SplatOutput, check_values, guard_sides
 
 _RECORD = 8  # values of a record
 
@@ -255,11 +255,9 @@ def splat(disks: Disks, camera: Camera, viewport: Viewport, config: SplatConfig)
     like = {"dtype": disks.positions.dtype, "device": disks.positions.device}
     pose = torch.as_tensor(camera.camera_from_world, **like)
     lens = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], **like)
-    band, width, height = config.guard_band, camera.width, camera.height
-    guard = (-band * width, -band * height, (1 + band) * width, (1 + band) * height)
     reach = (config.support, config.alpha_min)
     means, forms, visible = splat_project(
-        *disks[:4], pose, lens, *viewport, config.low_pass, *reach, config.near, *guard
+        *disks[:4], pose, lens, *viewport, config.low_pass, *reach, config.near, *guard_sides(camera, config)
     )
     opacities, features = disks[3:]
     bins = splat_bin(means.detach(), forms.detach(), opacities.detach(), visible, *viewport, *reach)

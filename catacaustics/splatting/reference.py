@@ -28,6 +28,7 @@ from torch import Tensor
 
 from catacaustics.cameras import Camera, Viewport
 from catacaustics.config import SplatConfig
+from catacaustics.kernels import host_kernel
 from catacaustics.shapes import Float, Int
 
 
@@ -375,15 +376,22 @@ def splat(disks: Disks, camera: Camera, viewport: Viewport, config: SplatConfig)
 
 
 def _in_guard_band(positions: Tensor, pose: Tensor, camera: Camera, config: SplatConfig) -> Tensor:
-    """Points in front of the near plane whose centre is not too far outside the image (SplatConfig.guard_band)."""
+    """Points in front of the near plane whose centre lies in the guard band."""
     x, y, z = (positions @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
     kept = z > config.near
     inv_z = torch.where(kept, 1 / z, 1)
-    axes = ((x, camera.fx, camera.cx, camera.width), (y, camera.fy, camera.cy, camera.height))
-    for coordinate, focal, center, size in axes:
+    left, top, right, bottom = guard_sides(camera, config)
+    axes = ((x, camera.fx, camera.cx, left, right), (y, camera.fy, camera.cy, top, bottom))
+    for coordinate, focal, center, low, high in axes:
         mean = focal * coordinate * inv_z + center
-        kept = kept & (mean > -config.guard_band * size) & (mean < (1 + config.guard_band) * size)
+        kept = kept & (mean > low) & (mean < high)
     return kept
+
+
+def guard_sides(camera: Camera, config: SplatConfig) -> tuple[float, float, float, float]:
+    """Left, top, right and bottom of the guard band, in pixels: points whose centre is farther out are dropped."""
+    band, width, height = config.guard_band, camera.width, camera.height
+    return -band * width, -band * height, (1 + band) * width, (1 + band) * height
 
 
 def _reach2(opacities: Tensor, config: SplatConfig) -> Tensor:
@@ -437,6 +445,13 @@ def points_in_view(
     config = config or SplatConfig()
     with torch.no_grad():
         pose = torch.tensor(camera.camera_from_world, dtype=positions.dtype, device=positions.device)
+        if (kernel := host_kernel("cull", positions)) and footprints.dtype == positions.dtype:
+            lens = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=positions.dtype)
+            visible = torch.empty(len(positions), dtype=torch.int64)
+            inputs = (positions.contiguous(), footprints.contiguous(), pose, lens)
+            cuts = (config.low_pass, config.support, config.near, *guard_sides(camera, config))
+            count, _ = kernel(len(positions), *inputs, *viewport, *cuts, visible)
+            return visible[:count]
         x, y, z = (positions @ pose[:3, :3].T + pose[:3, 3]).unbind(-1)
         inside = _in_guard_band(positions, pose, camera, config)
         inv_z = torch.where(inside, 1 / z, 1)

@@ -12,6 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from catacaustics.config import TrainConfig
+from catacaustics.kernels import host_kernel
 from catacaustics.scene import Scene
 from catacaustics.training.corrections import Corrections
 
@@ -64,13 +65,15 @@ class RowAdam(torch.optim.Optimizer):
     def step(self, closure: None = None) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         for group in self.param_groups:
             parameter = group["params"][0]
-            if parameter.grad is None or group["lr"] == 0:
+            if parameter.grad is None or group["lr"] == 0 or parameter.numel() == 0:
                 continue
             state = self.state[parameter]
             if not state:
                 count = math.prod(parameter.shape[: group["rows"]])
                 state["step"] = torch.zeros(count, device=parameter.device)
                 state["exp_avg"], state["exp_avg_sq"] = torch.zeros_like(parameter), torch.zeros_like(parameter)
+            if _native_step(group, parameter, state):
+                continue
             if group["rows"]:
                 moments = (state["exp_avg"], state["exp_avg_sq"])
                 value, gradient, mean, square = (
@@ -89,16 +92,33 @@ class RowAdam(torch.optim.Optimizer):
                 _adam((parameter, parameter.grad, state["step"], *moments), group)
 
 
+def _native_step(group: dict, parameter: Tensor, state: dict[str, Tensor]) -> bool:
+    """The step in native code, in one pass over the gradient; False where PyTorch is to do it."""
+    kernel = host_kernel("adam", parameter)
+    tensors = (parameter, state["exp_avg"], state["exp_avg_sq"])
+    inputs = [t for t in (parameter.grad, group["row_rates"]) if t is not None]
+    alike = all(t.dtype == parameter.dtype and t.is_contiguous() for t in (*inputs, *tensors))
+    if kernel is None or not alike:
+        return False
+    count = math.prod(parameter.shape[: group["rows"]]) if group["rows"] else 0
+    rates = (group["lr"], *group["betas"], group["eps"], group["weight_decay"])
+    width = parameter.numel() // max(count, 1)
+    kernel(count, width, parameter.grad, group["row_rates"], *rates, state["step"], *tensors)
+    return True
+
+
 def _adam(tensors: Sequence[Tensor], group: dict, scale: Tensor | float = 1.0) -> None:
     """One step in place on value, gradient, step, mean and mean square; step and `scale` have one number a row, or one
     for all."""
     value, gradient, step, mean, square = tensors
     beta1, beta2 = group["betas"]
     step += 1
+    count = step.double()  # 1 - 0.999 has four digits in single precision
     mean.lerp_(gradient, 1 - beta1)
     square.mul_(beta2).addcmul_(gradient, gradient, value=1 - beta2)
     shape = (-1,) + (1,) * (value.ndim - 1) if group["rows"] else ()
-    rate = (group["lr"] * scale * (1 - beta2**step).sqrt() / (1 - beta1**step)).reshape(shape)
+    corrections = ((1 - beta2**count).sqrt() / (1 - beta1**count)).to(value.dtype)
+    rate = (group["lr"] * scale * corrections).reshape(shape)
     value.mul_(1 - group["lr"] * group["weight_decay"])
     value.sub_(rate * mean / (square.sqrt() + group["eps"]))
 

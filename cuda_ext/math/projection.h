@@ -129,6 +129,23 @@ CATACAUSTICS_HD auto can_touch(const ScreenSplat<T>& splat, T reach2, const Fram
            (splat.w >= T(0)) & (splat.v > T(0));
 }
 
+// Whether a disk of squared radius s may touch the window, whatever its normal: its variance along screen x is at most
+// s (fx/z)^2 (1 + (x/z)^2) + low_pass. False for values that are not numbers.
+template <class T, class S>
+CATACAUSTICS_HD auto may_touch(
+    const View<T>& view, Vec3<T> position, T s, T support, T low_pass, const Frame<S>& frame) {
+    const Vec3<T> camera = rotate(view, position) + view.translation;
+    const T inv_z = T(1) / camera.z, u = camera.x * inv_z, v = camera.y * inv_z;
+    const T kx = view.fx * inv_z, ky = view.fy * inv_z;
+    const T mean_x = view.fx * u + view.cx, mean_y = view.fy * v + view.cy;
+    const T reach_x = support * square_root(s * kx * kx * (T(1) + u * u) + low_pass);
+    const T reach_y = support * square_root(s * ky * ky * (T(1) + v * v) + low_pass);
+    return (camera.z > T(frame.near)) & (mean_x > T(frame.guard_left)) & (mean_y > T(frame.guard_top)) &
+           (mean_x < T(frame.guard_right)) & (mean_y < T(frame.guard_bottom)) & (mean_x + reach_x > T(frame.left)) &
+           (mean_x - reach_x < T(frame.right)) & (mean_y + reach_y > T(frame.top)) &
+           (mean_y - reach_y < T(frame.bottom));
+}
+
 template <class T>
 struct ScreenGradient {
     T mean_x, mean_y, w, m, v;
