@@ -47,7 +47,10 @@ _SIGNATURES = {
     "finite": [_P, _P, _I],
 }
 # In the CPU's libraries alone: PyTorch does these on a GPU.
-_HOST_SIGNATURES: dict[str, list] = {}
+_HOST_SIGNATURES: dict[str, list] = {
+    "network": [_P, *[_I] * 4, *[_P] * 5],
+    "network_backward": [_P, *[_I] * 4, *[_P] * 9],
+}
 
 
 class NativeError(Exception):
