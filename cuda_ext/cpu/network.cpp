@@ -214,8 +214,10 @@ void Network<S>::run(
 template <class S>
 void copy_rows(const S* from, int columns, int rows, S* to) {
     const int line = padded<S>(columns);
-    for (int i = 0; i < rows; ++i)
-        for (int k = 0; k < line; ++k) to[i * line + k] = k < columns ? from[i * columns + k] : S(0);
+    for (int i = 0; i < rows; ++i, from += columns, to += line) {
+        for (int k = columns & ~1; k < line; ++k) to[k] = S(0);
+        for (int k = 0; k < columns; ++k) to[k] = from[k];
+    }
 }
 
 template <class S>
@@ -252,16 +254,11 @@ void Network<S>::forward(int64_t pixels, const Images<const S>& in, S* image, in
 template <class S>
 void Network<S>::add_gradients(const Linear<S>& layer, int rows, const S* g, const S* x, S* sums) const {
     if (!learns_) return;
-    using P = Pack<S>;
     const int in = padded<S>(layer.in), out = padded<S>(layer.out);
-    S* g_rows = sums + layer.g_rows_place;
+    S *g_rows = sums + layer.g_rows_place, *g_start = sums + layer.g_start_place;
     multiply<S>({layer.out, rows, in, g, 1, out, x, in, g_rows, nullptr, g_rows, in});
-    if (!layer.bias) return;
-    for (int o = 0; o < out; o += P::size) {
-        P sum = P::load(sums + layer.g_start_place + o);
-        for (int i = 0; i < rows; ++i) sum = sum + P::load(g + i * out + o);
-        sum.store(sums + layer.g_start_place + o);
-    }
+    const S one(1);
+    if (layer.bias) multiply<S>({1, rows, out, &one, 0, 0, g, out, g_start, nullptr, g_start, out});
 }
 
 // g_x = start + g W, and 0 where ReLU was 0
