@@ -21,7 +21,7 @@ enum { kPrimary, kReflection, kDecoder, kMlps };
 
 // Gradients of parameters are summed over groups of at least kGroupBlocks blocks, then over at most kGroups groups:
 // these do not depend on the number of threads.
-constexpr int64_t kGroupBlocks = 4, kGroups = 64;
+constexpr int64_t kGroupBlocks = 4, kGroups = 32;
 
 // Activations of a layer take three eighths of a first-level cache: those before and behind it fit.
 template <class S>
@@ -180,6 +180,7 @@ BlockArrays<S> Network<S>::arrays(bool keep) const {
             take(at.g_code, widest);
         }
         if (used > room) {
+            room = 0;
             memory.allocate(used);
             room = used;
         }
