@@ -52,6 +52,8 @@ _HOST_SIGNATURES = {
     "cull": [_P, _I, *[_P] * 4, *[_I] * 4, *[_D] * 7, _P],
     "environment": [_P, _I, *[_I] * 3, *[_P] * 4],
     "environment_backward": [_P, _I, *[_I] * 3, *[_P] * 7],
+    "network": [_P, *[_I] * 4, *[_P] * 5],
+    "network_backward": [_P, *[_I] * 4, *[_P] * 9],
     "quadric_images": [_P, _I, *[_P] * 4, _I, _I, *[_P] * 6],
     "quadric_positions": [_P, _I, *[_P] * 7],
     "quadric_backward": [_P, _I, *[_P] * 8],

@@ -3,6 +3,7 @@
 import torch
 from torch import Tensor, nn
 
+from catacaustics.renderer_native import decode
 from catacaustics.shapes import Float
 
 FEATURES = 6
@@ -40,7 +41,8 @@ class ResidualMLP(nn.Module):
         self.blocks = nn.Sequential(*(_ResidualBlock(width, blocks) for _ in range(blocks)))
 
     def forward(self, x: Tensor) -> Tensor:
-        return self.blocks(self.input(x).relu_()).relu_()
+        x = self.input(x).relu_()
+        return self.blocks(x).relu_() if len(self.blocks) else x
 
 
 class NeuralRenderer(nn.Module):
@@ -66,6 +68,9 @@ class NeuralRenderer(nn.Module):
         directions: Float[Tensor, "height width 3"],
     ) -> Float[Tensor, "height width 3"]:
         """Decode features, already weighted by 1 - rho and rho, and unit view directions to RGB (not clamped)."""
+        native = decode(primary, reflection, directions, list(self.parameters()))
+        if native is not None:
+            return native
         # A list of pixels: in-place steps on views of it would be copied by autograd.
         seen = torch.cat([primary, directions], -1).flatten(0, 1)
         code = torch.cat([self.primary_encoder(seen), self.reflection_encoder(reflection.flatten(0, 1))], -1)

@@ -25,6 +25,7 @@ FLOORS = [
     "splatting",
     "capture",
     "reflectors",
+    "renderer_native",
     "renderer",
     "environment",
     "scene",
