@@ -76,6 +76,23 @@ class _Run(ctypes.Structure):
     ]
 
 
+class _Memory:
+    """Blocks of bytes that a call asks for, and why there was none."""
+
+    def __init__(self, device: torch.device):
+        self.blocks: list[Tensor] = []
+        self.error: Exception | None = None
+        self._device = device
+
+    def allocate(self, size: int) -> int | None:
+        try:
+            self.blocks.append(torch.empty(size, dtype=torch.uint8, device=self._device))
+            return self.blocks[-1].data_ptr()
+        except Exception as error:  # out of memory: nothing may be raised through C
+            self.error = error
+            return None
+
+
 class NativeLibrary(NamedTuple):
     """A loaded library: where it lies, how it was built, the side of its tiles in pixels."""
 
@@ -98,28 +115,18 @@ class NativeLibrary(NamedTuple):
             MemoryError, ValueError: out of memory; more points or pixels than the library can number.
             NativeError: the GPU failed.
         """
-        blocks: list[Tensor] = []
-        errors: list[Exception] = []
-
-        def allocate(size: int) -> int | None:
-            try:
-                blocks.append(torch.empty(size, dtype=torch.uint8, device=like.device))
-                return blocks[-1].data_ptr()
-            except Exception as error:  # out of memory: nothing may be raised through C
-                errors.append(error)
-                return None
-
+        memory = _Memory(like.device)
         on_gpu = like.device.type == "cuda"
         stream = torch.cuda.current_stream(like.device).cuda_stream if on_gpu else None
-        run = _Run(_ALLOCATE(allocate), torch.get_num_threads(), stream, like.device.index or 0, deterministic)
+        run = _Run(_ALLOCATE(memory.allocate), torch.get_num_threads(), stream, like.device.index or 0, deterministic)
         function = getattr(self.handle, f"catacaustics_{name}_{'f32' if like.dtype == torch.float32 else 'f64'}")
         values = [a.data_ptr() if isinstance(a, Tensor) else a for a in arguments]
         with torch.cuda.device(like.device) if on_gpu else contextlib.nullcontext():
             status = function(ctypes.byref(run), *values)
         if status >= 0 or status == INVALID_VALUES:
-            return status, blocks
+            return status, memory.blocks
         if status == _OUT_OF_MEMORY:
-            raise MemoryError("the native splatter ran out of memory") from (errors[0] if errors else None)
+            raise MemoryError("a native kernel ran out of memory") from memory.error
         if status == _TOO_LARGE:
             raise ValueError("the native splatter takes up to 2^31 points and viewports of up to 2^20 pixels a side")
         raise NativeError(f"{self.path.name}: {self.handle.catacaustics_problem().decode()}")

@@ -17,26 +17,27 @@ from catacaustics.scene import Scene
 from catacaustics.training.corrections import Corrections
 
 
+def _decay(progress: float, start: float, end: float) -> float:
+    return start * math.exp(progress * math.log(end / start))
+
+
 def _rate(name: str, config: TrainConfig, extent: float, progress: float, warm_up: bool) -> float:
     """Learning rate of a parameter at a progress in [0, 1] (after the warm-up, where geometry stands still)."""
-
-    def decay(start: float, end: float) -> float:
-        return start * math.exp(progress * math.log(end / start))
 
     kind = name.split(".")[-1]
     if name.startswith("corrections."):
         start = config.lr_pose if kind == "poses" else config.lr_exposure
-        return 0.0 if warm_up else decay(start, start / 10)
+        return 0.0 if warm_up else _decay(progress, start, start / 10)
     if name.startswith("renderer.") or ".network." in name:
-        return decay(config.lr_network, config.lr_network_final)
+        return _decay(progress, config.lr_network, config.lr_network_final)
     if name.startswith("warps."):
-        return decay(config.lr_shape, config.lr_shape / 50)
+        return _decay(progress, config.lr_shape, config.lr_shape / 50)
     if name.startswith("reflections.") and kind == "positions":
-        return decay(config.lr_source, config.lr_source / 100)  # times the row's distance from the reflector
+        return _decay(progress, config.lr_source, config.lr_source / 100)  # times the row's distance from the reflector
     if name.startswith("environment."):
-        return decay(config.lr_environment, config.lr_environment * config.lr_final_share)
+        return _decay(progress, config.lr_environment, config.lr_environment * config.lr_final_share)
     if kind == "positions":
-        return 0.0 if warm_up else extent * decay(config.lr_position, config.lr_position_final)
+        return 0.0 if warm_up else extent * _decay(progress, config.lr_position, config.lr_position_final)
     if kind == "normals" and warm_up:
         return 0.0
     start = {
@@ -46,7 +47,7 @@ def _rate(name: str, config: TrainConfig, extent: float, progress: float, warm_u
         "rho_logits": config.lr_opacity,
         "features": config.lr_features,
     }[kind]
-    return decay(start, start * config.lr_final_share)
+    return _decay(progress, start, start * config.lr_final_share)
 
 
 class RowAdam(torch.optim.Optimizer):
