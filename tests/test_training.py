@@ -12,6 +12,7 @@ from toy import BALL_COLOR, ball_mask, make_toy_capture
 from catacaustics.capture.dataset import open_capture
 from catacaustics.config import TrainConfig
 from catacaustics.errors import UserError
+from catacaustics.reflectors.volume import ReflectionVolume, build_volume
 from catacaustics.scene import Scene
 from catacaustics.training import loop
 from catacaustics.training.densification import GradientStatistics, densify
@@ -23,6 +24,7 @@ from catacaustics.training.initialize import (
     start_cloud,
 )
 from catacaustics.training.optimizer import RowAdam, make_optimizer
+from catacaustics.training.photographs import PhotographCache, choose_patch, scaled_camera
 from catacaustics.training.train import train
 
 
@@ -178,6 +180,22 @@ def test_rows_follow_adam_and_stand_still_while_they_have_no_gradient():
     torch.testing.assert_close(ours[:3], theirs, rtol=1e-5, atol=1e-6)
     assert torch.equal(ours[3:5], start[3:5])
     torch.testing.assert_close((ours[5] - start[5] * (1 - 0.1 * 0.2)).abs(), torch.full((3,), 0.1), rtol=1e-4, atol=0)
+
+
+def test_masks_are_made_once_for_a_photograph_and_size_and_patches_lie_on_them(capture, monkeypatch):
+    volume, view = build_volume(capture, "ball"), capture.train[0]
+    cache, camera = PhotographCache(capture), scaled_camera(view.camera, 64, 1.0)
+    masks = cache.masks(view, camera, [volume, volume.scaled(0.5)])
+    np.testing.assert_array_equal(masks[0], volume.project_mask(camera))
+    assert 0 < masks[1].sum() < masks[0].sum()
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        window = choose_patch(camera, masks[1:], 2, 1.0, rng)
+        assert masks[1, window.y0 + 1, window.x0 + 1]
+    assert cache.masks(view, scaled_camera(view.camera, 32, 1.0), [volume]).shape[2] == 32
+    monkeypatch.setattr(ReflectionVolume, "project_mask", None)
+    assert cache.masks(view, camera, [volume]) is masks
+    assert cache.masks(capture.train[1], camera, []).shape == (0, camera.height, camera.width)
 
 
 def test_densification_spawns_downhill_keeps_moments_and_respects_the_cap(capture_path, tmp_path):

@@ -292,7 +292,8 @@ def _step(
         index = state.queue.pop()
         view = capture.train[index]
         camera = scaled_camera(view.camera, config.image_size, stage.scale)
-        viewport = choose_patch(camera, volumes, config.patch, config.reflector_share, state.rng)
+        shown = photographs.masks(view, camera, volumes)
+        viewport = choose_patch(camera, shown, config.patch, config.reflector_share, state.rng)
         image = photographs.get(view, camera.width, camera.height)
         x0, y0, width, height = viewport
         patch = np.ascontiguousarray(image[y0 : y0 + height, x0 : x0 + width])
@@ -300,7 +301,7 @@ def _step(
         layers = scene.layers(camera, viewport, motion=state.corrections.motion(index))
         if layers.splats.screen.requires_grad:
             layers.splats.screen.retain_grad()
-        masks = [torch.from_numpy(v.project_mask(camera, viewport)).to(scene.device) for v in scene.volumes]
+        masks = [torch.from_numpy(m[y0 : y0 + height, x0 : x0 + width]).to(scene.device) for m in shown]
         rgb = state.corrections.expose(index, scene.decode(layers))
         losses, psnr = _losses(rgb, layers, target, masks, config)
         total = torch.stack(list(losses.values())).sum() / config.accumulate
