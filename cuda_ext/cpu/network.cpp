@@ -344,7 +344,8 @@ void Network<S>::backward(
             };
             const auto add_image = [&](S* g_x) {
                 for (int i = 0; g_x && i < at.rows; ++i)
-                    for (int c = 0; c < kColour; ++c) g_x[(first + i) * features_ + c] += g_image[(first + i) * kColour + c];
+                    for (int c = 0; c < kColour; ++c)
+                        g_x[(first + i) * features_ + c] += g_image[(first + i) * kColour + c];
             };
             std::swap(at.g, at.g_hidden);
             back_through_blocks(kPrimary, at, own);
