@@ -5,6 +5,7 @@ import sys
 from typing import Annotated
 
 from catacaustics.errors import UserError
+from catacaustics.threads import rest_between_loops
 
 # command: (module, function, configuration)
 _COMMANDS = {
@@ -48,6 +49,7 @@ def _help(group: str = "") -> str:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run one command; returns the exit status: 0, 2 for bad input, 130 when interrupted."""
+    rest_between_loops()
     arguments = sys.argv[1:] if arguments is None else arguments
     if not arguments or arguments[0] in ("-h", "--help", "help"):
         print(_help())

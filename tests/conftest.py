@@ -6,6 +6,10 @@
 import pytest
 from jaxtyping import install_import_hook
 
+from catacaustics.threads import rest_between_loops
+
+rest_between_loops()
+
 install_import_hook("catacaustics", "beartype.beartype")
 
 import splatter  # noqa: E402

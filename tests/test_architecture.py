@@ -15,6 +15,7 @@ PACKAGE = Path(catacaustics.__file__).parent
 FLOORS = [
     "shapes",
     "errors",
+    "threads",
     "config",
     "kernels",
     "files",

@@ -1,6 +1,7 @@
 """The command line: help, one clear message and status 2 for bad input, the main job end to end."""
 
 import json
+import os
 
 import numpy as np
 import pytest
@@ -34,6 +35,18 @@ def test_help_lists_every_command_and_each_has_its_own_help(capsys):
             cli.main([*command.split(), "--help"])
         assert stop.value.code == 0
         assert command in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("said", "spins"), [({}, "10000"), ({"GOMP_SPINCOUNT": "7"}, "7"), ({"OMP_WAIT_POLICY": "ACTIVE"}, None)], ids=str
+)
+def test_threads_of_pytorch_sleep_soon_unless_the_environment_says_how_they_wait(monkeypatch, said, spins):
+    for name in ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY"):
+        monkeypatch.delenv(name, raising=False)
+    for name, value in said.items():
+        monkeypatch.setenv(name, value)
+    cli.main(["--version"])
+    assert os.environ.get("GOMP_SPINCOUNT") == spins
 
 
 def test_an_unknown_command_is_named_and_the_known_ones_are_listed(capsys):

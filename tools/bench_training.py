@@ -7,7 +7,9 @@
 A finished run is trained on, in a copy, from its last checkpoint: full resolution, all points. The variants take turns,
 step by step, in one process; times are medians.
 
-    python tools/bench_training.py demo/run --json bench.json
+    GOMP_SPINCOUNT=10000 python tools/bench_training.py demo/run --json bench.json
+
+The variable is what the command line sets (catacaustics/threads.py).
 """
 
 import argparse
