@@ -5,7 +5,7 @@
     PyTorch             everything in PyTorch, as where there is no compiler
 
 A finished run is trained on, in a copy, from its last checkpoint: full resolution, all points. The variants take turns,
-step by step, in one process; times are medians.
+step by step, in one process; times are medians, of the whole step and of its largest parts.
 
     GOMP_SPINCOUNT=10000 python tools/bench_training.py demo/run --json bench.json
 
@@ -20,6 +20,8 @@ import shutil
 import statistics
 import tempfile
 import time
+from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
 
@@ -27,16 +29,27 @@ import torch
 
 from catacaustics import scene as scenes
 from catacaustics.config import TrainConfig
+from catacaustics.environment import EnvironmentMap
 from catacaustics.kernels import find_library
 from catacaustics.reflectors.volume import build_volume
+from catacaustics.renderer import NeuralRenderer
 from catacaustics.run import open_run
 from catacaustics.scene import Scene
 from catacaustics.splatting import splat_points
 from catacaustics.training.initialize import named_reflectors
 from catacaustics.training.loop import fit
+from catacaustics.training.optimizer import RowAdam
 from catacaustics.training.photographs import scaled_camera
 
 VARIANTS = ("native", "PyTorch splatter", "PyTorch")
+PARTS = {
+    "which points a view can show": (scenes, "points_in_view"),
+    "reflection points and their images": (Scene, "reflection_disks"),
+    "environment map, forward": (EnvironmentMap, "forward"),
+    "networks, forward": (NeuralRenderer, "forward"),
+    "backward": (torch.Tensor, "backward"),
+    "Adam": (RowAdam, "step"),
+}
 
 
 def choose(variant: str) -> None:
@@ -46,8 +59,23 @@ def choose(variant: str) -> None:
     scenes.splat_points = splat_points if variant == "native" else in_pytorch
 
 
-def step_times(run: Path, copy: Path, steps: int) -> tuple[dict[str, list[float]], Scene, TrainConfig]:
-    """Seconds of steps by variant, after every photograph has been read once; the scene, and the settings."""
+def timed(function: Callable, spent: dict[str, float], part: str) -> Callable:
+    """The function, which adds the time of every call to spent[part]."""
+
+    @functools.wraps(function)
+    def call(*arguments: object, **named: object) -> object:
+        start = time.perf_counter()
+        try:
+            return function(*arguments, **named)
+        finally:
+            spent[part] += time.perf_counter() - start
+
+    return call
+
+
+def step_times(run: Path, copy: Path, steps: int) -> tuple[dict[str, dict[str, list[float]]], Scene, TrainConfig]:
+    """Seconds of steps and of their parts by variant, after every photograph has been read once; the scene, and the
+    settings."""
     opened = open_run(run)
     shutil.copy(run / "checkpoint.safetensors", copy / "checkpoint.safetensors")
     known = {f.name for f in fields(TrainConfig)}
@@ -58,13 +86,20 @@ def step_times(run: Path, copy: Path, steps: int) -> tuple[dict[str, list[float]
     # Densification belongs to no variant.
     changes = {"run": copy, "resume": True, "minutes": None, "iterations": last, "densifications": 0}
     config = TrainConfig(**(settings | changes | {"model": tuple(settings["model"])}))
-    times: dict[str, list[float]] = {variant: [] for variant in VARIANTS}
+    times: dict[str, dict[str, list[float]]] = {variant: defaultdict(list) for variant in VARIANTS}
     state = {"step": 0, "before": 0.0}
+    spent: dict[str, float] = defaultdict(float)
+    for part, (owner, name) in PARTS.items():
+        setattr(owner, name, timed(getattr(owner, name), spent, part))
 
     def watch(_: Scene) -> None:
         now, index = time.perf_counter(), state["step"] - warm
         if index > 0:
-            times[VARIANTS[(index - 1) % len(VARIANTS)]].append(now - state["before"])
+            own = times[VARIANTS[(index - 1) % len(VARIANTS)]]
+            own["step"].append(now - state["before"])
+            for part in PARTS:
+                own[part].append(spent[part])
+        spent.clear()
         choose(VARIANTS[max(index, 0) % len(VARIANTS)])
         state["step"] += 1
         state["before"] = time.perf_counter()
@@ -74,6 +109,7 @@ def step_times(run: Path, copy: Path, steps: int) -> tuple[dict[str, list[float]
 
 
 def render_times(scene: Scene, run: Path, image_size: int, runs: int) -> dict[str, list[float]]:
+    """Seconds to render a held-out view with all its layers, by variant."""
     view = open_run(run).capture.held_out[0]
     camera = scaled_camera(view.camera, image_size, 1.0)
     times: dict[str, list[float]] = {variant: [] for variant in VARIANTS}
@@ -101,12 +137,12 @@ def main() -> None:
         steps, scene, config = step_times(options.run, Path(folder), options.steps)
     renders = render_times(scene, options.run, config.image_size, 5)
     results = {}
-    for name, times in (("step", steps), ("view", renders)):
-        medians = {variant: statistics.median(values) for variant, values in times.items()}
+    print(f"{'ms':<36}" + "".join(f"{variant:>22}" for variant in VARIANTS))
+    for name in ("step", *PARTS, "view"):
+        medians = {v: statistics.median(renders[v] if name == "view" else steps[v][name]) for v in VARIANTS}
         results[name] = medians
-        for variant, value in medians.items():
-            ratio = value / medians["native"]
-            print(f"{name:<5} {variant:<17} {1000 * value:8.1f} ms  {ratio:5.2f} times native")
+        cells = (f"{1000 * value:13.1f} ({value / medians['native']:5.2f} x)" for value in medians.values())
+        print(f"{name:<36}" + "".join(f"{cell:>22}" for cell in cells))
     if options.json:
         options.json.write_text(json.dumps({**header, **results}))
 

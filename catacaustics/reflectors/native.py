@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
 from catacaustics.kernels import host_kernel
 from catacaustics.reflectors import quadric
@@ -71,6 +72,7 @@ class _Positions(torch.autograd.Function):
         return positions, near
 
     @staticmethod
+    @once_differentiable
     def backward(ctx, g: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         sources = ctx.saved_tensors[0]
         g_sources, g_mirror = torch.empty_like(sources), sources.new_empty(15)
