@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from catacaustics.kernels import host_kernel
+from catacaustics.kernels import host_kernel, library_for
 from catacaustics.renderer import FEATURES
 from catacaustics.shapes import Float, Int
 
@@ -97,7 +97,7 @@ class _NativeLookup(torch.autograd.Function):
         features, row, column = (t.contiguous() for t in (features, row, column))
         ctx.save_for_backward(features, row, column)
         found = features.new_empty(len(row), features.shape[2])
-        host_kernel("environment", features)(len(row), *features.shape, features, row, column, found)
+        library_for(features).call("environment", features, len(row), *features.shape, features, row, column, found)
         return found
 
     @staticmethod
@@ -107,7 +107,7 @@ class _NativeLookup(torch.autograd.Function):
             torch.empty_like(t) if wanted else None
             for t, wanted in zip(ctx.saved_tensors, ctx.needs_input_grad, strict=True)
         ]
-        kernel = host_kernel("environment_backward", g_found)
         features, row, _ = ctx.saved_tensors
-        kernel(len(row), *features.shape, *ctx.saved_tensors, g_found.contiguous(), *gradients)
+        sizes, inputs = (len(row), *features.shape), (*ctx.saved_tensors, g_found.contiguous())
+        library_for(features).call("environment_backward", features, *sizes, *inputs, *gradients)
         return tuple(gradients)

@@ -34,7 +34,7 @@ class _Decode(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, g_image: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx, g_image: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         tensors, needed = ctx.saved_tensors, ctx.needs_input_grad
         inputs, parameters = tensors[:3], tensors[3:]
         learns = any(needed[3:])

@@ -84,8 +84,9 @@ def step_times(run: Path, copy: Path, steps: int) -> tuple[dict[str, dict[str, l
     done = json.loads((run / "metrics.jsonl").read_text().splitlines()[-1])["step"]
     last = done + warm + len(VARIANTS) * steps + 10
     # Densification belongs to no variant.
-    changes = {"run": copy, "resume": True, "minutes": None, "iterations": last, "densifications": 0}
-    config = TrainConfig(**(settings | changes | {"model": tuple(settings["model"])}))
+    settings |= {"run": copy, "resume": True, "minutes": None, "iterations": last, "densifications": 0}
+    settings["model"] = tuple(settings["model"])
+    config = TrainConfig(**settings)
     times: dict[str, dict[str, list[float]]] = {variant: defaultdict(list) for variant in VARIANTS}
     state = {"step": 0, "before": 0.0}
     spent: dict[str, float] = defaultdict(float)

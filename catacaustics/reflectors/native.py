@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from catacaustics.kernels import host_kernel
+from catacaustics.kernels import host_kernel, library_for
 from catacaustics.reflectors import quadric
 from catacaustics.shapes import Bool, Float
 
@@ -41,14 +41,15 @@ def quadric_images(
         return None
     inputs = (sources, camera, center, axes)
     if start is not None:
-        return QuadricImages(*_Positions.apply(*inputs, start), start)
-    fixed = [t.detach().contiguous() for t in inputs]
+        positions, near = _Positions.apply(*inputs, start)
+        return QuadricImages(positions, near, start)
+    a, b, c, d = (t.detach().contiguous() for t in inputs)
     n = len(sources)
-    u = quadric.stationary(*fixed, concave) if concave else sources.new_empty(n, 3)
+    u = quadric.stationary(a, b, c, d, concave) if concave else sources.new_empty(n, 3)
     positions, normals = sources.new_empty(n, 3), sources.new_empty(n, 3)
     stretch, near = sources.new_empty(n), sources.new_empty(n)
     visible = torch.empty(n, dtype=torch.bool)
-    kernel(n, *fixed, concave, not concave, u, positions, normals, stretch, near, visible)
+    kernel(n, a, b, c, d, concave, not concave, u, positions, normals, stretch, near, visible)
     if torch.is_grad_enabled() and any(t.requires_grad for t in inputs):
         positions, near = _Positions.apply(*inputs, u)
     return QuadricImages(positions, near, u, normals, stretch, visible)
@@ -64,9 +65,7 @@ class _Positions(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:
         inputs = [t.contiguous() for t in (sources, start, camera, center, axes)]
         positions, near = torch.empty_like(inputs[0]), sources.new_empty(len(sources))
-        kernel = host_kernel("quadric_positions", sources)
-        assert kernel is not None
-        kernel(len(sources), *inputs, positions, near)
+        library_for(sources).call("quadric_positions", sources, len(sources), *inputs, positions, near)
         ctx.save_for_backward(*inputs)
         ctx.mark_non_differentiable(near)
         return positions, near
@@ -76,7 +75,6 @@ class _Positions(torch.autograd.Function):
     def backward(ctx, g: Tensor, _: Tensor) -> tuple[Tensor | None, ...]:  # pyright: ignore[reportIncompatibleMethodOverride]
         sources = ctx.saved_tensors[0]
         g_sources, g_mirror = torch.empty_like(sources), sources.new_empty(15)
-        kernel = host_kernel("quadric_backward", sources)
-        assert kernel is not None
-        kernel(len(sources), *ctx.saved_tensors, g.contiguous(), g_sources, g_mirror)
+        gradients = (g.contiguous(), g_sources, g_mirror)
+        library_for(sources).call("quadric_backward", sources, len(sources), *ctx.saved_tensors, *gradients)
         return g_sources, g_mirror[:3], g_mirror[3:6], g_mirror[6:].view(3, 3), None
