@@ -23,7 +23,6 @@ def _decay(progress: float, start: float, end: float) -> float:
 
 def _rate(name: str, config: TrainConfig, extent: float, progress: float, warm_up: bool) -> float:
     """Learning rate of a parameter at a progress in [0, 1] (after the warm-up, where geometry stands still)."""
-
     kind = name.split(".")[-1]
     if name.startswith("corrections."):
         start = config.lr_pose if kind == "poses" else config.lr_exposure

@@ -2,8 +2,8 @@
 #include <vector>
 
 #include "../math/projection.h"
+#include "columns.h"
 #include "guarded.h"
-#include "simd.h"
 #include "threads.h"
 
 namespace catacaustics {
@@ -25,19 +25,15 @@ struct Cull {
 template <class S>
 int64_t cull_chunk(const Cull<S>& cull, int64_t begin, int64_t end, int64_t* visible) {
     using P = Pack<S>;
-    alignas(64) S x[P::size], y[P::size], z[P::size], footprint[P::size];
+    alignas(64) S footprint[P::size];
+    Columns<S> columns;
     int64_t kept = 0;
     for (int64_t first = begin; first < end; first += P::size) {
         const int here = int(std::min<int64_t>(P::size, end - first));
-        for (int lane = 0; lane < P::size; ++lane) {
-            const int64_t i = first + std::min(lane, here - 1);
-            x[lane] = cull.positions[3 * i];
-            y[lane] = cull.positions[3 * i + 1];
-            z[lane] = cull.positions[3 * i + 2];
-            footprint[lane] = cull.footprints[i];
-        }
+        for (int lane = 0; lane < P::size; ++lane)
+            footprint[lane] = cull.footprints[first + std::min(lane, here - 1)];
         const auto touches = may_touch(
-            cull.view, Vec3<P>{P::load(x), P::load(y), P::load(z)}, P::load(footprint), P(cull.support),
+            cull.view, columns.load(cull.positions, first, here), P::load(footprint), P(cull.support),
             P(cull.low_pass), cull.frame);
         if (!any<S>(touches)) continue;
         for (int lane = 0; lane < here; ++lane) {

@@ -28,13 +28,7 @@ struct Product {
 };
 
 // Sums that are held in registers, beside the operands: of 32 registers, 16, and 16 without fused multiply-add.
-#if defined(__AVX512F__)
-constexpr int kSums = 24;
-#elif defined(__AVX2__)
-constexpr int kSums = 12;
-#else
-constexpr int kSums = 8;
-#endif
+constexpr int kSums = kVectorBytes == 64 ? 24 : kVectorBytes == 32 ? 12 : 8;
 
 template <class S, int rows, int packs>
 void multiply_tile(const Product<S>& p, int row, int column) {

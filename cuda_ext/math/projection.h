@@ -74,12 +74,11 @@ CATACAUSTICS_HD Projection<T> project_disk(const View<T>& view, Vec3<T> position
     r.v = r.camera.y * r.inv_z;
     r.kx = view.fx * r.inv_z;
     r.ky = view.fy * r.inv_z;
-    // Tangents t1 = (1 + sign x^2 a, sign b, -sign x) and t2 = (b, sign + y^2 a, -y).
-    r.sign = select(n.z < T(0), T(-1), T(1));
-    r.a = T(-1) / (r.sign + n.z);
-    r.b = n.x * n.y * r.a;
-    const Vec3<T> t1{T(1) + r.sign * n.x * n.x * r.a, r.sign * r.b, -(r.sign * n.x)};
-    const Vec3<T> t2{r.b, r.sign + n.y * n.y * r.a, -n.y};
+    const Tangents<T> tangents(n);
+    r.sign = tangents.sign;
+    r.a = tangents.a;
+    r.b = tangents.b;
+    const Vec3<T> t1 = tangents.first, t2 = tangents.second;
     r.d11 = t1.x - r.u * t1.z;
     r.d21 = t1.y - r.v * t1.z;
     r.d12 = t2.x - r.u * t2.z;

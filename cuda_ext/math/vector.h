@@ -38,11 +38,13 @@ CATACAUSTICS_HD Vec3<T> select(Condition condition, Vec3<T> yes, Vec3<T> no) {
 // Two orthonormal tangents of a unit vector (Duff et al. 2017, "Building an Orthonormal Basis, Revisited").
 template <class T>
 struct Tangents {
+    T sign, a, b;
     Vec3<T> first, second;
 
     CATACAUSTICS_HD explicit Tangents(Vec3<T> n) {
-        const T sign = select(n.z < T(0), T(-1), T(1));
-        const T a = T(-1) / (sign + n.z), b = n.x * n.y * a;
+        sign = select(n.z < T(0), T(-1), T(1));
+        a = T(-1) / (sign + n.z);
+        b = n.x * n.y * a;
         first = {T(1) + sign * n.x * n.x * a, sign * b, -(sign * n.x)};
         second = {b, sign + n.y * n.y * a, -n.y};
     }
