@@ -62,6 +62,8 @@ class LiveView:
         self.due = now + max(_SECONDS, (now - start + drawing) / _SHARE)
 
     def close(self) -> None:
+        if self.viewer is not None:
+            self.viewer.close()
         self.server.stop()
 
 

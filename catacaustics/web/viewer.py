@@ -59,6 +59,7 @@ def view(config: ViewConfig) -> None:
     except KeyboardInterrupt:
         print("\nStopped.")
     finally:
+        viewer.close()
         server.stop()
 
 
@@ -109,6 +110,7 @@ class Viewer:
         self.server, self.scene, self.capture, self.folder = server, scene, capture, Path(folder)
         self.lock = threading.Lock()
         self.windows: dict[int, _Window] = {}
+        self.threads: list[threading.Thread] = []
         self.frozen: Camera | None = None
         self.path: list[Camera] = []
         self.clouds: dict[str, Any] = {}
@@ -131,6 +133,14 @@ class Viewer:
             self.drawing_seconds = 0.0
         self._show_scene()
         self.touch()
+
+    def close(self) -> None:
+        """Stop drawing and wait for the pictures under way: a server that has stopped takes none, and Python must not
+        end inside of one."""
+        for window in list(self.windows.values()):
+            window.close()
+        for thread in self.threads:
+            thread.join()
 
     def touch(self) -> None:
         """Draw all windows again."""
@@ -310,7 +320,8 @@ class Viewer:
     # Windows ---------------------------------------------------------------------------------------------------------
 
     def _connect(self, client: Any) -> None:
-        self.windows[client.client_id] = _Window(self, client)
+        window = self.windows[client.client_id] = _Window(self, client)
+        self.threads = [thread for thread in self.threads if thread.is_alive()] + [window.thread]
         self._go(client, 0)
 
     def _disconnect(self, client: Any) -> None:
@@ -328,7 +339,8 @@ class _Window:
         self.share = 0.3  # of a still picture's width, for pictures of a moving camera
         self.depths = (0.0, 1.0)
         client.camera.on_update(lambda _: self.changed.set())
-        threading.Thread(target=self._work, daemon=True).start()
+        self.thread = threading.Thread(target=self._work, daemon=True)
+        self.thread.start()
 
     def close(self) -> None:
         self.open = False
@@ -354,7 +366,7 @@ class _Window:
             self._draw(self.share)
             # It moves on: another quick picture. It stands still: sharper ones, up to the full size.
             share = self.share
-            while share < 1 and not self.changed.wait(_STILL_SECONDS):
+            while share < 1 and self.open and not self.changed.wait(_STILL_SECONDS):
                 share = min(2.5 * share, 1.0)
                 self._draw(share)
 
@@ -365,6 +377,8 @@ class _Window:
         if share == 1:
             self.depths = depth_range(output)
         picture = self.picture(output)
+        if not self.open:
+            return
         self.client.scene.set_background_image(picture, "jpeg", jpeg_quality=92 if share == 1 else 80)
         seconds = time.perf_counter() - start
         self.viewer.drawing_seconds += seconds
