@@ -267,7 +267,7 @@ def backend_for(device: str, backend: Backend | None = None) -> str:
 
     Args:
         device: "cpu" or "cuda".
-        backend: which one to take; None asks the environment variable CATACAUSTICS_SPLATTER. auto takes the fastest
+        backend: which one to take; None asks the environment variable CATACAUSTICS_BACKEND. auto takes the fastest
             there is, and says so once where that is the reference.
 
     Raises:

@@ -11,7 +11,9 @@
 
 namespace catacaustics {
 
-constexpr int kTile = 32;
+// In larger tiles splats are listed fewer times; of smaller ones, blocks of pairs stay in the cache. Where vectors are long
+// there are half as many blocks.
+constexpr int kTile = kVectorBytes == 64 ? 32 : 16;
 
 // The splats of a window, near to far, as listed by catacaustics_bin. Features are those of all points, looked up
 // through `visible`; the list of a tile is entries[starts[tile]], ..., entries[starts[tile + 1] - 1].

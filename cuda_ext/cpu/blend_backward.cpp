@@ -25,8 +25,8 @@ template <class S, int C>
 struct BackwardTile {
     using P = Pack<S>;
     using Shape = TileShape<S>;
-    // Blocks of pairs held at a time; 1 byte and two packs each.
-    static constexpr int kStored = 1 << 14;
+    // Blocks of pairs held at a time.
+    static constexpr int kStored = 1 << 13;
     static constexpr int kSums = (kGeometry + C + 3) / 4 * 4;
 
     struct StoredPairs {
@@ -43,46 +43,43 @@ struct BackwardTile {
     alignas(64) S behind[Shape::blocks][Shape::lanes];
     alignas(64) S through[Shape::blocks][Shape::lanes];
     StoredPairs pairs[kStored];
-    uint8_t blocks[kStored + kSpare];
-    LiveBlocks<S> live;
-    std::vector<int> starts;  // of an entry's pairs
+    BlockSet<S> live;
+    int held;  // blocks of pairs
+    std::vector<BlockSet<S>> sets;  // of the entries whose pairs are held
     std::vector<Checkpoint> checkpoints;
 
     // Front to back from entry `from`, storing the pairs, until they fill the store; returns the entry after the last.
     int64_t sweep(
         const Bins<S>& bins, const int32_t* entries, int64_t from, int64_t count, S tile_x, S tile_y, S stop) {
-        starts.clear();
-        starts.push_back(0);
+        sets.clear();
         int stored = 0;
         // Without early stop all count: the gradient of an opaque splat is the difference that it makes.
-        live.set_all();
+        live = kAllBlocks<S>;
         for (const int64_t first = from; from < count && stored + kGroup * Shape::blocks <= kStored;) {
-            if (stop > S(0) && (from - first) % LiveBlocks<S>::kEvery == 0) live.update(through, stop);
-            if (live.none()) break;
-            const int64_t end = std::min(count, from + kGroup);
-            int listed = stored;
-            for (int64_t entry = from; entry < end; ++entry) {
-                if (entry + kGroup < count) prefetch_record(bins.record(entries[entry + kGroup]), C);
-                const Record<S>& record = *reinterpret_cast<const Record<S>*>(bins.record(entries[entry]));
-                uint8_t* own = blocks + listed;
-                listed += live.keep(own, list_blocks(at, record, tile_x - record.mean_x, tile_y - record.mean_y, own));
-                starts.push_back(listed);
-            }
-            const int* ends = starts.data() + starts.size() - (end - from);
-            for (; from < end; ++from, ++ends) {
-                const Record<S>& record = *reinterpret_cast<const Record<S>*>(bins.record(entries[from]));
-                const TileSplat<S> splat(record, tile_x, tile_y);
-                for (; stored < *ends; ++stored) {
-                    const int block = blocks[stored];
+            if (stop > S(0) && (from - first) % kLiveEvery == 0) live = live_blocks(through, stop);
+            if (!live) break;
+            const int here = int(std::min<int64_t>(count - from, kGroup));
+            prefetch_group(bins, entries + from + kGroup, entries + count, C);
+            sets.resize(sets.size() + here);
+            BlockSet<S>* own = &sets[sets.size() - here];
+            find_blocks(bins, entries + from, here, tile_x, tile_y, own);
+            for (int i = 0; i < here; ++i) {
+                own[i] &= live;
+                const TileSplat<S> splat(
+                    *reinterpret_cast<const Record<S>*>(bins.record(entries[from + i])), tile_x, tile_y);
+                each_block(own[i], [&](int block) {
                     P t = P::load(through[block]);
                     const P falloff = splat.falloff(splat.offset(at, block), t, P(stop));
                     t.store(pairs[stored].through);
                     falloff.store(pairs[stored].falloff);
                     blend_step(P(splat.opacity), falloff, t);
                     t.store(through[block]);
-                }
+                    ++stored;
+                });
             }
+            from += here;
         }
+        held = stored;
         return from;
     }
 
@@ -97,7 +94,7 @@ struct BackwardTile {
             checkpoints.back().entry = entry;
             std::memcpy(checkpoints.back().through, through, sizeof through);
             entry = sweep(bins, entries, entry, count, tile_x, tile_y, stop);
-            if (live.none()) {  // splats behind are drawn nowhere
+            if (!live) {  // splats behind are drawn nowhere
                 std::memset(out + entry * gradient_stride(C), 0, (count - entry) * gradient_stride(C) * sizeof(S));
                 count = entry;
             }
@@ -112,25 +109,27 @@ struct BackwardTile {
             for (int64_t entry = end; entry-- > begin;) {
                 if (entry >= begin + kGroup) prefetch_record(bins.record(entries[entry - kGroup]), C);
                 const S* data = bins.record(entries[entry]);
+                const BlockSet<S> set = sets[entry - begin];
+                held -= count_blocks(set);
                 blend_splat(
-                    *reinterpret_cast<const Record<S>*>(data), data + kHeader, starts[entry - begin],
-                    starts[entry - begin + 1], tile_x, tile_y, out + entry * gradient_stride(C));
+                    *reinterpret_cast<const Record<S>*>(data), data + kHeader, set, pairs + held, tile_x, tile_y,
+                    out + entry * gradient_stride(C));
             }
             end = begin;
         }
     }
 
     CATACAUSTICS_HD void blend_splat(
-        const Record<S>& record, const S* features, int first, int end, S tile_x, S tile_y, S* out) {
+        const Record<S>& record, const S* features, BlockSet<S> set, const StoredPairs* pair, S tile_x, S tile_y, S* out) {
         const TileSplat<S> splat(record, tile_x, tile_y);
         const P opacity(splat.opacity), zero(S(0));
         P feature[C > 0 ? C : 1], sums[kSums];
         for (int c = 0; c < C; ++c) feature[c] = P(features[c]);
         for (auto& sum : sums) sum = zero;
         PairSums<P> geometry{zero, zero, zero, zero, zero, zero};
-        for (int i = first; i < end; ++i) {
-            const int block = blocks[i];
-            const P falloff = P::load(pairs[i].falloff), t = P::load(pairs[i].through);
+        each_block(set, [&](int block) {
+            const P falloff = P::load(pair->falloff), t = P::load(pair->through);
+            ++pair;
             const P weight = opacity * falloff * t;
             P color = zero;
             for (int c = 0; c < C; ++c) {
@@ -143,7 +142,7 @@ struct BackwardTile {
             r.store(behind[block]);
             const auto d = splat.offset(at, block);
             add_pair(geometry, h, d.skew, d.dy);
-        }
+        });
         sums[0] = geometry.h;
         sums[1] = geometry.skew;
         sums[2] = geometry.dy;

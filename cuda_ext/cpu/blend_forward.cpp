@@ -15,49 +15,37 @@ struct ForwardTile {
     LaneCoordinates<S> at;
     alignas(64) S image[Shape::blocks][C > 0 ? C : 1][Shape::lanes];
     alignas(64) S through[Shape::blocks][Shape::lanes];
-    LiveBlocks<S> live;
-    uint8_t blocks[kGroup * Shape::blocks + kSpare];
-    int ends[kGroup];
+    BlockSet<S> sets[kGroup];
 
     void blend(const Bins<S>& bins, int64_t tile, S tile_x, S tile_y, S stop) {
         std::memset(image, 0, sizeof image);
         for (auto& block : through) P(S(1)).store(block);
-        live.set_all();
+        BlockSet<S> live = kAllBlocks<S>;
         const int32_t* entries = bins.begin(tile);
         const int64_t count = bins.end(tile) - entries;
         for (int64_t first = 0; first < count; first += kGroup) {
-            if (first > 0 && first % LiveBlocks<S>::kEvery == 0) live.update(through, stop);
-            if (live.none()) return;
-            const int64_t end = std::min(count, first + kGroup);
-            int listed = 0;
-            for (int64_t entry = first; entry < end; ++entry) {
-                if (entry + kGroup < count) prefetch_record(bins.record(entries[entry + kGroup]), C);
-                const Record<S>& record = *reinterpret_cast<const Record<S>*>(bins.record(entries[entry]));
-                uint8_t* own = blocks + listed;
-                listed += live.keep(own, list_blocks(at, record, tile_x - record.mean_x, tile_y - record.mean_y, own));
-                ends[entry - first] = listed;
-            }
-            int begin = 0;
-            for (int64_t entry = first; entry < end; begin = ends[entry - first], ++entry)
-                blend_splat(bins.record(entries[entry]), begin, ends[entry - first], tile_x, tile_y, stop);
+            if (first > 0 && first % kLiveEvery == 0) live = live_blocks(through, stop);
+            if (!live) return;
+            const int here = int(std::min<int64_t>(count - first, kGroup));
+            prefetch_group(bins, entries + first + kGroup, entries + count, C);
+            find_blocks(bins, entries + first, here, tile_x, tile_y, sets);
+            for (int i = 0; i < here; ++i)
+                blend_splat(bins.record(entries[first + i]), sets[i] & live, tile_x, tile_y, stop);
         }
     }
 
-    CATACAUSTICS_HD void blend_splat(const S* data, int begin, int end, S tile_x, S tile_y, S stop) {
+    CATACAUSTICS_HD void blend_splat(const S* data, BlockSet<S> set, S tile_x, S tile_y, S stop) {
         const TileSplat<S> splat(*reinterpret_cast<const Record<S>*>(data), tile_x, tile_y);
         P color[C > 0 ? C : 1];
         for (int c = 0; c < C; ++c) color[c] = P(data[kHeader + c]);
-        for (int i = begin; i < end; ++i) {
-            const int block = blocks[i];
+        each_block(set, [&](int block) {
             P t = P::load(through[block]);
             const P falloff = splat.falloff(splat.offset(at, block), t, P(stop));
             const P weight = blend_step(P(splat.opacity), falloff, t);
             t.store(through[block]);
-            for (int c = 0; c < C; ++c) {
-                S* pixel = image[block][c];
-                (P::load(pixel) + weight * color[c]).store(pixel);
-            }
-        }
+            auto& pixels = image[block];
+            for (int c = 0; c < C; ++c) (P::load(pixels[c]) + weight * color[c]).store(pixels[c]);
+        });
     }
 };
 
