@@ -29,9 +29,10 @@ from catacaustics.errors import UserError
 from catacaustics.files import atomic_path, read_json, write_json
 from catacaustics.points import write_ply
 
-ERRORS, HYPOTHESES = (2.0, 3.0), 2
+ERRORS, HYPOTHESES = (3.0, 2.0), 2
 """Relative poses looked for in each pair: two at each inlier threshold in pixels. More than one, because the loops tell
-right from wrong later, and a right one that is missing breaks the chain."""
+right from wrong later, and a right one that is missing breaks the chain. Where there is none at the wider threshold,
+there is none at the narrower one."""
 
 TIED_SHARE = 0.9
 """Share of the photographs that loops should tie together; below it, other focal lengths are tried too."""
@@ -234,10 +235,13 @@ def _pairs_in_loops(
     """Relative poses of all pairs, as far as loops of photographs believe them."""
     from tqdm import tqdm
 
-    edges = []
+    edges, left = [], matches
     with tqdm(total=len(matches) * len(ERRORS), desc="relative poses", unit="pair") as progress:
         for error in ERRORS:
-            edges += sfm.relative_poses(features, matches, cameras, error, 3000, HYPOTHESES, progress.update)
+            progress.update(len(matches) - len(left))
+            found = sfm.relative_poses(features, left, cameras, error, 3000, HYPOTHESES, progress.update)
+            edges = found + edges
+            left = {pair: matches[pair] for pair in dict.fromkeys((e.first, e.second) for e in found)}
     pairs = believable_pairs(edges, count)
     print(
         f"  pairs: {len({(e.first, e.second) for e in edges})} with a common geometry, {len(pairs)} of them in loops "
