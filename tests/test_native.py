@@ -465,6 +465,19 @@ def test_a_whole_image_has_the_gradients_of_its_halves_together():
 
 
 @needs_native
+@pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="memory is read from Linux' /proc")
+def test_memory_kept_for_calls_to_come_is_bounded_and_goes_back_to_the_system_when_asked():
+    def resident() -> int:
+        return 1024 * int(Path("/proc/self/status").read_text().split("VmRSS:")[1].split()[0])
+
+    scene = [t.requires_grad_() for t in random_scene(400_000, 8, dtype=torch.float32, size=0.002)]
+    splat_points(*scene, front_camera(640, 400, 500.0), backend="cpu").image.sum().backward()
+    before = resident()
+    find_library("cpu").library.handle.catacaustics_release()
+    assert 2**23 < before - resident() < 2**28 + 2**23
+
+
+@needs_native
 def test_the_screen_positions_are_in_the_graph_for_densification():
     scene = [t.requires_grad_() for t in random_scene(30, dtype=torch.float32, size=0.1)]
     out = splat_points(*scene, front_camera(), backend="cpu")

@@ -1,8 +1,9 @@
 """Time and check the splatter's backends on this machine.
 
     speed       forward and backward of each backend, in seconds and in yardsticks: one yardstick is `torch.exp` over a
-                float32 tensor with as many elements as there are splat-pixel pairs. Ratios to it carry over from one
-                machine to another far better than seconds do.
+                float32 tensor with as many elements as there are splat-pixel pairs, into one that is there already (a
+                new one takes up to four times as long, as the system deals out its pages). Ratios to it carry over
+                from one machine to another far better than seconds do.
     cut-offs    what the `fast` preset, and each of its knobs, saves in time and costs in error against `exact`.
     growth      time against the number of pairs over three decades, and memory for each pair in flight.
     rounding    float32 against float64: relative error of the image and of every gradient.
@@ -111,6 +112,7 @@ def speed(options: argparse.Namespace) -> list[dict]:
         scene, camera = random_splats(count, width, height, options.channels)
         pairs = count_pairs(scene, camera, SplatConfig())
         values, total = -torch.rand(pairs), {}
+        place = torch.empty_like(values)
         # A step of the reference at 1M takes as long as a hundred of the others.
         runs = min(options.runs, 3) if "reference" in backends and count > 200_000 else options.runs
         rows: dict[str, list] = {backend: [] for backend in backends}
@@ -119,7 +121,7 @@ def speed(options: argparse.Namespace) -> list[dict]:
                 step = timed_step(
                     lambda scene=scene, camera=camera, b=backend: splat_points(*scene, camera, backend=b), scene
                 )
-                rows[backend].append((*step, seconds(lambda values=values: torch.exp(values))))
+                rows[backend].append((*step, seconds(lambda v=values, p=place: torch.exp(v, out=p))))
         for backend in backends:
             forward, backward, yardstick = medians(rows[backend])
             total[backend] = forward + backward
@@ -199,7 +201,11 @@ def working_memory(scene: Disks, camera: Camera) -> float:
     def kibibytes(field: str) -> int:
         return int(status.read_text().split(f"{field}:")[1].split()[0])
 
-    ctypes.CDLL(None).malloc_trim(0)  # memory that is free, but not yet the system's again, would hide ours
+    # Memory that is free, but not yet the system's again, would hide ours.
+    library = find_library("cpu").library
+    if library is not None:
+        library.handle.catacaustics_release()
+    ctypes.CDLL(None).malloc_trim(0)
     reset.write_text("5")  # the peak starts anew from what is held now
     before = kibibytes("VmRSS")
     timed_step(lambda: splat_points(*scene, camera), scene)

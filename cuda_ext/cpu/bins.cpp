@@ -119,6 +119,9 @@ int64_t bin(
 
 CATACAUSTICS_EXPORT int64_t catacaustics_tile() { return kTile; }
 
+// Gives the memory that is kept for calls to come back to the system.
+CATACAUSTICS_EXPORT void catacaustics_release() { kept_blocks().release(); }
+
 // Returns how many entries there are; `entries` is set to the one of the allocated blocks that holds them.
 #define CATACAUSTICS_BIN(S, SUFFIX)                                                                                    \
     CATACAUSTICS_EXPORT int64_t catacaustics_bin_##SUFFIX(                                                             \
