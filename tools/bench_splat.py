@@ -1,9 +1,9 @@
 """Time and check the splatter's backends on this machine.
 
     speed       forward and backward of each backend, in seconds and in yardsticks: one yardstick is `torch.exp` over a
-                float32 tensor with as many elements as there are splat-pixel pairs, into one that is there already (a
-                new one takes up to four times as long, as the system deals out its pages). Ratios to it carry over
-                from one machine to another far better than seconds do.
+                float32 tensor with as many elements as there are splat-pixel pairs: into memory that is there already,
+                and into new memory, which can take four times as long while the system deals out its pages. Ratios to
+                them carry over from one machine to another far better than seconds do.
     cut-offs    what the `fast` preset, and each of its knobs, saves in time and costs in error against `exact`.
     growth      time against the number of pairs over three decades, and memory for each pair in flight.
     rounding    float32 against float64: relative error of the image and of every gradient.
@@ -97,6 +97,16 @@ def timed_step(splat: Callable[[], tuple[Tensor, ...]], scene: Sequence[Tensor])
     return forward, seconds(lambda: torch.autograd.backward(outputs, g))
 
 
+def exponentials(values: Tensor) -> tuple[float, float]:
+    """Seconds of `torch.exp` into memory that is there, and into memory that is new to the process (Linux)."""
+    place = torch.zeros_like(values)
+    there = seconds(lambda: torch.exp(values, out=place))
+    del place
+    if Path("/proc/self/clear_refs").exists():
+        ctypes.CDLL(None).malloc_trim(0)
+    return there, seconds(lambda: torch.exp(values))
+
+
 def medians(rows: list[tuple[float, ...]]) -> list[float]:
     """Of each column, but for the first row (the warm-up)."""
     return [statistics.median(column) for column in zip(*rows[1:], strict=True)]
@@ -112,7 +122,6 @@ def speed(options: argparse.Namespace) -> list[dict]:
         scene, camera = random_splats(count, width, height, options.channels)
         pairs = count_pairs(scene, camera, SplatConfig())
         values, total = -torch.rand(pairs), {}
-        place = torch.empty_like(values)
         # A step of the reference at 1M takes as long as a hundred of the others.
         runs = min(options.runs, 3) if "reference" in backends and count > 200_000 else options.runs
         rows: dict[str, list] = {backend: [] for backend in backends}
@@ -121,16 +130,22 @@ def speed(options: argparse.Namespace) -> list[dict]:
                 step = timed_step(
                     lambda scene=scene, camera=camera, b=backend: splat_points(*scene, camera, backend=b), scene
                 )
-                rows[backend].append((*step, seconds(lambda v=values, p=place: torch.exp(v, out=p))))
+                rows[backend].append(step)
+        yardstick, new = medians([exponentials(values) for _ in range(options.runs + 1)])
+        print(
+            f"{size:>5} {pairs / 1e6:.1f} M pairs: yardstick {1000 * yardstick:.1f} ms, into new memory"
+            f" {1000 * new:.1f} ms"
+        )
         for backend in backends:
-            forward, backward, yardstick = medians(rows[backend])
+            forward, backward = medians(rows[backend])
             total[backend] = forward + backward
             print(
-                f"{size:>5} {backend:<10} forward {1000 * forward:8.1f} ms ({forward / yardstick:6.2f} yardsticks)"
-                f"  backward {1000 * backward:8.1f} ms ({backward / yardstick:6.2f})"
-                f"  yardstick {1000 * yardstick:6.1f} ms for {pairs / 1e6:.1f} M pairs"
+                f"{size:>5} {backend:<10} forward {1000 * forward:8.1f} ms ({forward / yardstick:6.2f} yardsticks;"
+                f" {forward / new:6.2f})  backward {1000 * backward:8.1f} ms ({backward / yardstick:6.2f};"
+                f" {backward / new:6.2f})"
             )
-            figures = {"forward": forward, "backward": backward, "yardstick": yardstick, "pairs": pairs}
+            figures = {"forward": forward, "backward": backward, "yardstick": yardstick, "yardstick_new": new}
+            figures |= {"pairs": pairs}
             results.append({"size": size, "count": count, "backend": backend} | figures)
         library = find_library("cpu").library
         if library is not None:
