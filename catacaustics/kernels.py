@@ -252,7 +252,7 @@ def library_for(tensor: Tensor) -> NativeLibrary:
     """The library for a tensor's device. Raises NativeError where there is none."""
     library, problem = find_library(tensor.device.type)
     if library is None:
-        raise NativeError(f"no native splatter: {problem}")
+        raise NativeError(f"no native kernels: {problem}")
     return library
 
 
