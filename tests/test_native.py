@@ -1,5 +1,6 @@
 """Hard cases of splatting, on every backend against the reference in float64; and what only native code has."""
 
+import ctypes
 import math
 import subprocess
 import sys
@@ -466,15 +467,16 @@ def test_a_whole_image_has_the_gradients_of_its_halves_together():
 
 @needs_native
 @pytest.mark.skipif(not Path("/proc/self/status").exists(), reason="memory is read from Linux' /proc")
-def test_memory_kept_for_calls_to_come_is_bounded_and_goes_back_to_the_system_when_asked():
+def test_memory_kept_for_calls_to_come_is_bounded_and_given_back_when_asked():
     def resident() -> int:
+        ctypes.CDLL(None).malloc_trim(0)  # what is free in malloc is not held by the library
         return 1024 * int(Path("/proc/self/status").read_text().split("VmRSS:")[1].split()[0])
 
     scene = [t.requires_grad_() for t in random_scene(400_000, 8, dtype=torch.float32, size=0.002)]
     splat_points(*scene, front_camera(640, 400, 500.0), backend="cpu").image.sum().backward()
     before = resident()
     find_library("cpu").library.handle.catacaustics_release()
-    assert 2**23 < before - resident() < 2**28 + 2**23
+    assert 2**24 < before - resident() < 2**28 + 2**23
 
 
 @needs_native
