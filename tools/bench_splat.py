@@ -145,8 +145,7 @@ def speed(options: argparse.Namespace) -> list[dict]:
                 f" {backward / new:6.2f})"
             )
             figures = {"forward": forward, "backward": backward, "yardstick": yardstick, "yardstick_new": new}
-            figures |= {"pairs": pairs}
-            results.append({"size": size, "count": count, "backend": backend} | figures)
+            results.append({"size": size, "count": count, "pairs": pairs, "backend": backend} | figures)
         library = find_library("cpu").library
         if library is not None:
             flat = torch.cat([t.detach().flatten() for t in scene])

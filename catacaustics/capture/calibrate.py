@@ -241,7 +241,7 @@ def _pairs_in_loops(
             progress.update(len(matches) - len(left))
             found = sfm.relative_poses(features, left, cameras, error, 3000, HYPOTHESES, progress.update)
             edges = found + edges
-            left = {pair: matches[pair] for pair in dict.fromkeys((e.first, e.second) for e in found)}
+            left = {(e.first, e.second): matches[e.first, e.second] for e in found}
     pairs = believable_pairs(edges, count)
     print(
         f"  pairs: {len({(e.first, e.second) for e in edges})} with a common geometry, {len(pairs)} of them in loops "

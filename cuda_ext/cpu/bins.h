@@ -11,8 +11,8 @@
 
 namespace catacaustics {
 
-// In larger tiles splats are listed fewer times; of smaller ones, blocks of pairs stay in the cache. Where vectors are long
-// there are half as many blocks.
+// In larger tiles splats are listed fewer times; of smaller ones, blocks of pairs stay in the cache. Where vectors are
+// long there are half as many blocks.
 constexpr int kTile = kVectorBytes == 64 ? 32 : 16;
 
 // The splats of a window, near to far, as listed by catacaustics_bin. Features are those of all points, looked up
@@ -37,6 +37,7 @@ class Bins {
     // Puts the features [first, first + channels) behind every header.
     void pack(int first, int channels, int threads);
     const S* record(int64_t splat) const { return records_.data() + splat * stride_; }
+    const Record<S>& header(int64_t splat) const { return *reinterpret_cast<const Record<S>*>(record(splat)); }
 
     const int32_t* begin(int64_t tile) const { return splats_.entries + splats_.starts[tile]; }
     const int32_t* end(int64_t tile) const { return splats_.entries + splats_.starts[tile + 1]; }

@@ -65,8 +65,7 @@ struct BackwardTile {
             find_blocks(bins, entries + from, here, tile_x, tile_y, own);
             for (int i = 0; i < here; ++i) {
                 own[i] &= live;
-                const TileSplat<S> splat(
-                    *reinterpret_cast<const Record<S>*>(bins.record(entries[from + i])), tile_x, tile_y);
+                const TileSplat<S> splat(bins.header(entries[from + i]), tile_x, tile_y);
                 each_block(own[i], [&](int block) {
                     P t = P::load(through[block]);
                     const P falloff = splat.falloff(splat.offset(at, block), t, P(stop));
@@ -108,19 +107,19 @@ struct BackwardTile {
             }
             for (int64_t entry = end; entry-- > begin;) {
                 if (entry >= begin + kGroup) prefetch_record(bins.record(entries[entry - kGroup]), C);
-                const S* data = bins.record(entries[entry]);
                 const BlockSet<S> set = sets[entry - begin];
                 held -= count_blocks(set);
                 blend_splat(
-                    *reinterpret_cast<const Record<S>*>(data), data + kHeader, set, pairs + held, tile_x, tile_y,
-                    out + entry * gradient_stride(C));
+                    bins.header(entries[entry]), bins.record(entries[entry]) + kHeader, set, pairs + held, tile_x,
+                    tile_y, out + entry * gradient_stride(C));
             }
             end = begin;
         }
     }
 
     CATACAUSTICS_HD void blend_splat(
-        const Record<S>& record, const S* features, BlockSet<S> set, const StoredPairs* pair, S tile_x, S tile_y, S* out) {
+        const Record<S>& record, const S* features, BlockSet<S> set, const StoredPairs* pair, S tile_x, S tile_y,
+        S* out) {
         const TileSplat<S> splat(record, tile_x, tile_y);
         const P opacity(splat.opacity), zero(S(0));
         P feature[C > 0 ? C : 1], sums[kSums];

@@ -39,7 +39,9 @@ CATACAUSTICS_HD void each_block(unsigned __int128 set, F&& function) {
 }
 
 inline int count_blocks(uint64_t set) { return __builtin_popcountll(set); }
-inline int count_blocks(unsigned __int128 set) { return count_blocks(uint64_t(set)) + count_blocks(uint64_t(set >> 64)); }
+inline int count_blocks(unsigned __int128 set) {
+    return count_blocks(uint64_t(set)) + count_blocks(uint64_t(set >> 64));
+}
 
 // Pixel coordinates within the tile, block by block.
 template <class S>
@@ -138,8 +140,7 @@ void find_blocks(const Bins<S>& bins, const int32_t* entries, int count, S tile_
         alignas(64) S in[7][lanes];
         alignas(64) typename Bits<S>::type out[parts][lanes], shift[lanes];
         for (int lane = 0; lane < lanes; ++lane) {
-            const int32_t entry = entries[std::min(first + lane, count - 1)];
-            const Record<S>& r = *reinterpret_cast<const Record<S>*>(bins.record(entry));
+            const Record<S>& r = bins.header(entries[std::min(first + lane, count - 1)]);
             in[0][lane] = r.mean_x;
             in[1][lane] = r.mean_y;
             in[2][lane] = r.m;
