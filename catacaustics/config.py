@@ -3,6 +3,7 @@
 Fields without a default are positional arguments; the text below a field is its help.
 """
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -58,6 +59,21 @@ class SplatConfig:
     """PyTorch only: splat-pixel pairs held at a time, about 60 bytes each; results do not depend on it."""
     deterministic: bool = False
     """GPU only: gradients are the same bit for bit in every run, as always on the CPU, for more memory and time."""
+
+    def __post_init__(self):
+        """Raise ValueError for settings that mean nothing; for ones that are not numbers, too."""
+        rules = {
+            "low_pass": (0 <= self.low_pass < math.inf, "at least 0"),
+            "support": (0 < self.support < math.inf, "above 0"),
+            "alpha_min": (0 <= self.alpha_min < 1, "in [0, 1)"),
+            "stop_transmittance": (0 <= self.stop_transmittance < 1, "in [0, 1)"),
+            "near": (0 < self.near < math.inf, "above 0"),
+            "guard_band": (0 <= self.guard_band < math.inf, "at least 0"),
+            "pair_budget": (self.pair_budget > 0, "above 0"),
+        }
+        for name, (right, wanted) in rules.items():
+            if not right:
+                raise ValueError(f"{name} must be {wanted} and finite, got {getattr(self, name)}")
 
     @classmethod
     def exact(cls, **settings: float) -> "SplatConfig":

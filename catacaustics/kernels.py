@@ -9,6 +9,7 @@ process.
 import contextlib
 import ctypes
 import functools
+import hashlib
 import logging
 import os
 import struct
@@ -128,7 +129,10 @@ class NativeLibrary(NamedTuple):
         if status == _OUT_OF_MEMORY:
             raise MemoryError("a native kernel ran out of memory") from memory.error
         if status == _TOO_LARGE:
-            raise ValueError("the native splatter takes up to 2^31 points and viewports of up to 2^20 pixels a side")
+            raise ValueError(
+                "the native splatter takes up to 2^31 points, viewports of up to a million pixels a side, and on a GPU"
+                " 2^31 entries in the lists of its tiles"
+            )
         raise NativeError(f"{self.path.name}: {self.handle.catacaustics_problem().decode()}")
 
     def bin(self, like: Tensor, *arguments: object) -> Tensor:
@@ -169,24 +173,31 @@ def load_library(path: Path) -> NativeLibrary:
 
 
 def _check_file(path: Path) -> None:
-    """Refuse a file that the system would map beyond its end, or that is for another kind of processor (Linux)."""
+    """Refuse a file that is not what was installed, that the system would map beyond its end, or that is for another
+    kind of processor (the last two on Linux)."""
     if not path.is_file():
         raise NativeError(f"{path.name} is not there")
+    data, sums = path.read_bytes(), path.with_name("SHA256SUMS")
+    listed = f"{hashlib.sha256(data).hexdigest()}  {path.name}".encode()
+    if sums.is_file() and listed not in sums.read_bytes().splitlines():
+        raise NativeError(
+            f"{path.name} is not what {sums.name} beside it says: damaged, or copied alone; install again"
+        )
     if not sys.platform.startswith("linux"):
         return
-    with path.open("rb") as file, Path(sys.executable).open("rb") as own:
-        data, python = file.read(), own.read(64)
+    with Path(sys.executable).open("rb") as own:
+        python = own.read(64)
     if data[:4] != b"\x7fELF" or len(data) < 64:
         raise NativeError(f"{path.name} is not a shared library")
     if data[4:6] != python[4:6] or data[18:20] != python[18:20]:
         raise NativeError(f"{path.name} was built for another kind of processor")
     start, (size, count) = struct.unpack_from("<Q", data, 32)[0], struct.unpack_from("<HH", data, 54)
-    if start + size * count > len(data):
-        raise NativeError(f"{path.name} is cut short")
+    if size < 56 or start + size * count > len(data):
+        raise NativeError(f"{path.name} is cut short or damaged")
     for segment in range(start, start + size * count, size):
         offset, length = struct.unpack_from("<Q", data, segment + 8)[0], struct.unpack_from("<Q", data, segment + 32)[0]
         if offset + length > len(data):
-            raise NativeError(f"{path.name} is cut short")
+            raise NativeError(f"{path.name} is cut short or damaged")
 
 
 def _check_one_splat(library: NativeLibrary, device: str) -> None:
@@ -215,7 +226,7 @@ def _check_one_splat(library: NativeLibrary, device: str) -> None:
 
 
 class Found(NamedTuple):
-    """A library, or why there is none."""
+    """A library, or None; and why there is none, or no better one."""
 
     library: NativeLibrary | None
     problem: str
@@ -229,7 +240,8 @@ def _folders() -> list[Path]:
 
 @functools.cache
 def find_library(device: str) -> Found:
-    """The best library for the tensors of a device ("cpu" or "cuda"), or why there is none. Looked for once."""
+    """The best library for the tensors of a device ("cpu" or "cuda"), and what is wrong with better ones. Looked for
+    once."""
     if device == "cuda" and not torch.cuda.is_available():
         built = any((folder / f"lib{_NAMES[device][0]}.so").is_file() for folder in _folders())
         return Found(None, f"torch sees no NVIDIA GPU (the library for one is {'' if built else 'not '}built)")
@@ -238,7 +250,7 @@ def find_library(device: str) -> Found:
         for path in (folder / f"lib{name}.so" for name in _NAMES[device]):
             if path.is_file():
                 try:
-                    return Found(load_library(path), "")
+                    return Found(load_library(path), "; ".join(problems))
                 except NativeError as error:
                     problems.append(str(error))
         failure = folder / "cuda_failure.txt"
@@ -281,8 +293,8 @@ def backend_for(device: str, backend: Backend | None = None) -> str:
         return "reference"
     if choice not in ("auto", device):
         raise UserError(f"backend {choice} for tensors on {device}", f"{device} or auto", "use backend auto")
-    problem = find_library(device).problem if device in ("cpu", "cuda") else f"there is none for {device}"
-    if not problem:
+    library, problem = find_library(device) if device in ("cpu", "cuda") else (None, f"there is none for {device}")
+    if library is not None:
         return device
     if choice == device:
         raise UserError(

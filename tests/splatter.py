@@ -59,6 +59,7 @@ def problem(backend: str) -> str:
     if backend == "reference":
         return ""
     try:
-        return (emulated_library() if backend == "emulated" else find_library(backend)).problem
+        found = emulated_library() if backend == "emulated" else find_library(backend)
+        return "" if found.library else found.problem
     except NativeError as error:
         return str(error)

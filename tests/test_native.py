@@ -355,7 +355,7 @@ def disks(**changes):
 )
 def test_tensors_that_do_not_go_together_are_refused_by_name(changes, message):
     with pytest.raises(ValueError, match=message):
-        reference.check_shapes(disks(**changes))
+        reference.check_shapes(**disks(**changes)._asdict())
 
 
 # What only native code has.

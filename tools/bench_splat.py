@@ -269,9 +269,9 @@ def rounding(options: argparse.Namespace) -> list[dict]:
 
 
 def against_gsplat(options: argparse.Namespace) -> list[dict]:
-    problem = find_library("cuda").problem or ("" if importlib.util.find_spec("gsplat") else "gsplat is not installed")
-    if problem:
-        print(f"not run: {problem}")
+    library, problem = find_library("cuda")
+    if library is None or not importlib.util.find_spec("gsplat"):
+        print(f"not run: {problem or 'gsplat is not installed'}")
         return []
     from gsplat import rasterization  # pyright: ignore[reportMissingImports]
 

@@ -7,7 +7,7 @@ from catacaustics.config import SplatConfig
 from catacaustics.kernels import Backend, backend_for
 from catacaustics.shapes import Float
 from catacaustics.splatting import native, reference
-from catacaustics.splatting.reference import Disks, SplatOutput, check_shapes, points_in_view
+from catacaustics.splatting.reference import Disks, SplatOutput, check_shapes, check_view, points_in_view
 
 __all__ = ["Backend", "SplatOutput", "backend_for", "points_in_view", "splat_points"]
 
@@ -30,17 +30,19 @@ def splat_points(
 
     Args:
         positions, normals: world space; normals of unit length.
-        footprints: squared radii, world units squared, non-negative.
+        footprints: squared radii, world units squared, non-negative, at most 1e16.
         opacities: in [0, 1].
         camera: pinhole camera in world units.
         viewport: pixels to compute; the whole image by default.
         backend: see `backend_for`.
 
     Raises:
-        ValueError: wrong shapes, types or devices, values that are not finite or out of range; the argument is named.
+        ValueError: wrong shapes, types or devices, values that are not finite or out of range, in the tensors, the
+            camera or the viewport; the argument is named.
         UserError: the backend does not run here.
     """
-    disks = Disks(positions, normals, footprints, opacities, features)
-    check_shapes(disks)
+    disks, viewport = Disks(positions, normals, footprints, opacities, features), viewport or camera.viewport
+    check_shapes(**disks._asdict())
+    check_view(camera, viewport)
     splat = reference.splat if backend_for(positions.device.type, backend) == "reference" else native.splat
-    return splat(disks, camera, viewport or camera.viewport, config or SplatConfig())
+    return splat(disks, camera, viewport, config or SplatConfig())

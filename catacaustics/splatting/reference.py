@@ -6,6 +6,8 @@ normal n, tangents t1, t2 and squared radius s, has the screen-space covariance
     Sigma = s J J^T + nu I,     J = P [t1 t2],     P = [[fx/z, 0, -fx x/z^2], [0, fy/z, -fy y/z^2]]
     det J = fx fy (n . X) / z^3,   det Sigma = (s det J)^2 + nu s tr(J J^T) + nu^2      (no subtraction)
 
+(divided by Sigma_22 before it is squared: disks that are larger than the scene would overflow.)
+
 The quadratic form is kept as a sum of squares, so that it is never negative however thin the ellipse is:
 
     d^T Sigma^-1 d = w (dx - m dy)^2 + v dy^2,   w = Sigma_22 / det Sigma, m = Sigma_12 / Sigma_22, v = 1 / Sigma_22
@@ -20,9 +22,11 @@ given slots by (rank within the pixel, pixel), pixels with many pairs first. The
 contiguous slice over a prefix of the pixels, and the recursions above are a few whole-slice operations a rank.
 """
 
+import math
 import warnings
 from typing import NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -97,12 +101,12 @@ def project(
     s22 = footprints * (j21 * j21 + j22 * j22)
     s12 = footprints * (j11 * j21 + j12 * j22)
     det_j = kx * ky * (n[:, 0] * u + n[:, 1] * v + n[:, 2])
-    det = (footprints * det_j) ** 2 + low_pass * (s11 + s22) + low_pass**2
-    s11, s22 = s11 + low_pass, s22 + low_pass
+    s_det, variance_x, variance_y = footprints * det_j, s11 + low_pass, s22 + low_pass
+    inv_w = s_det * (s_det / variance_y) + low_pass * ((s11 + variance_y) / variance_y)
     return ProjectedSplats(
         torch.stack([fx * u + cx, fy * v + cy], -1),
-        torch.stack([s22 / det, s12 / s22, 1 / s22], -1),
-        torch.stack([s11, s22], -1).detach().sqrt(),
+        torch.stack([1 / inv_w, s12 / variance_y, 1 / variance_y], -1),
+        torch.stack([variance_x, variance_y], -1).detach().sqrt(),
         z,
     )
 
@@ -402,18 +406,48 @@ def _reach2(opacities: Tensor, config: SplatConfig) -> Tensor:
     return reach2
 
 
-def check_shapes(disks: Disks) -> None:
-    """Raise ValueError, naming the argument, for shapes, types and devices that do not go together."""
-    positions = disks.positions
-    n, channels = len(positions), disks.features.shape[-1] if disks.features.ndim else 0
-    shapes = ((n, 3), (n, 3), (n,), (n,), (n, channels))
-    for (name, tensor), shape in zip(disks._asdict().items(), shapes, strict=True):
-        if tuple(tensor.shape) != shape:
-            raise ValueError(f"{name} must have shape {shape}, got {tuple(tensor.shape)}")
+LARGEST_FOOTPRINT = 1e16
+"""Squared radii up to here have gradients that 32 bits can hold."""
+
+
+def check_shapes(**arguments: object) -> None:
+    """Raise ValueError, naming the argument, for things that are no tensors, and for shapes, types and devices that do
+    not go together."""
+    tensors: dict[str, Tensor] = {}
+    for name, value in arguments.items():
+        if not isinstance(value, Tensor):
+            raise ValueError(f"{name} must be a torch.Tensor, got {type(value).__name__}")
+        tensors[name] = value
+    positions, features = tensors["positions"], tensors.get("features")
+    if positions.ndim != 2 or positions.shape[1] != 3:
+        raise ValueError(f"positions must have shape (n, 3), got {tuple(positions.shape)}")
+    n, channels = len(positions), features.shape[-1] if features is not None and features.ndim else 0
+    shapes = {"positions": (n, 3), "normals": (n, 3), "footprints": (n,), "opacities": (n,), "features": (n, channels)}
+    for name, tensor in tensors.items():
+        if tuple(tensor.shape) != shapes[name]:
+            raise ValueError(f"{name} must have shape {shapes[name]}, got {tuple(tensor.shape)}")
         if tensor.dtype != positions.dtype or tensor.dtype not in (torch.float32, torch.float64):
             raise ValueError(f"{name} must be float32 or float64 like positions, got {tensor.dtype}")
         if tensor.device != positions.device:
             raise ValueError(f"{name} must be on {positions.device} like positions, got {tensor.device}")
+
+
+def check_view(camera: Camera, viewport: Viewport) -> None:
+    """Raise ValueError, naming the value, for a camera that is not finite or a viewport that is no rectangle of pixels.
+    What torch.compile traces is not checked: it would have to leave its graph."""
+    if torch.compiler.is_compiling():
+        return
+    for name in ("fx", "fy", "cx", "cy"):
+        if not math.isfinite(getattr(camera, name)):
+            raise ValueError(f"camera.{name} must be finite, got {getattr(camera, name)}")
+    bad = np.argwhere(~np.isfinite(camera.camera_from_world))
+    if len(bad):
+        raise ValueError(
+            f"camera.camera_from_world has {len(bad)} values that are not finite, the first at {bad[0].tolist()}"
+        )
+    whole = all(isinstance(value, int | np.integer) for value in viewport)
+    if not whole or viewport.width < 0 or viewport.height < 0:
+        raise ValueError(f"viewport must be four whole numbers with width and height >= 0, got {tuple(viewport)}")
 
 
 def check_values(**tensors: Tensor) -> None:
@@ -423,12 +457,17 @@ def check_values(**tensors: Tensor) -> None:
         if not finite.all():
             bad = torch.nonzero(~finite)
             raise ValueError(f"{name} has {len(bad)} values that are not finite, the first at {bad[0].tolist()}")
-    rules = {"footprints": [(">= 0", torch.lt, 0)], "opacities": [(">= 0", torch.lt, 0), ("<= 1", torch.gt, 1)]}
-    for name, tensor in tensors.items():
-        for wanted, outside, limit in rules.get(name, []):
-            bad = torch.nonzero(outside(tensor, limit))
+    rules = {"footprints": (0, LARGEST_FOOTPRINT), "opacities": (0, 1)}
+    for name, (least, most) in rules.items():
+        if name not in tensors:
+            continue
+        for wanted, outside in ((f">= {least}", tensors[name] < least), (f"<= {most}", tensors[name] > most)):
+            bad = torch.nonzero(outside)
             if len(bad):
-                raise ValueError(f"{name} must be {wanted}: {len(bad)} are not, the first at {bad[0].tolist()}")
+                first = float(tensors[name][bad[0, 0]])
+                raise ValueError(
+                    f"{name} must be {wanted}: {len(bad)} are not, the first at {bad[0].tolist()} is {first:g}"
+                )
 
 
 def points_in_view(
@@ -441,11 +480,16 @@ def points_in_view(
     """Indices of the points that may touch a viewport: a cheap cull before features and gradients are computed.
 
     Conservative: whatever its normal, a disk's variance along screen x is at most s (fx/z)^2 (1 + (x/z)^2) + nu.
+
+    Raises:
+        ValueError: wrong shapes, types or devices, a camera that is not finite; the argument is named.
     """
     config = config or SplatConfig()
+    check_shapes(positions=positions, footprints=footprints)
+    check_view(camera, viewport)
     with torch.no_grad():
         pose = torch.tensor(camera.camera_from_world, dtype=positions.dtype, device=positions.device)
-        if (kernel := host_kernel("cull", positions)) and footprints.dtype == positions.dtype:
+        if kernel := host_kernel("cull", positions):
             lens = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=positions.dtype)
             visible = torch.empty(len(positions), dtype=torch.int64)
             inputs = (positions.contiguous(), footprints.contiguous(), pose, lens)

@@ -13,7 +13,7 @@ constexpr int kGeometry = 6;
 // Such gradients held at a time.
 constexpr int64_t kBatchBytes = int64_t(1) << 27;
 
-inline int64_t gradient_stride(int channels) { return (kGeometry + channels + 7) / 8 * 8; }
+constexpr int gradient_stride(int channels) { return (kGeometry + channels + 7) / 8 * 8; }
 
 template <class S>
 struct Gradients {
@@ -21,105 +21,137 @@ struct Gradients {
     S *means, *forms, *opacities, *features;
 };
 
-template <class S, int C>
-struct BackwardTile {
+// Goes through the entries of a tile front to back and then back to front; compiled once for all numbers of channels.
+template <class S>
+class TileSweeps {
     using P = Pack<S>;
     using Shape = TileShape<S>;
-    // Blocks of pairs held at a time.
-    static constexpr int kStored = 1 << 13;
-    static constexpr int kSums = (kGeometry + C + 3) / 4 * 4;
 
-    struct StoredPairs {
+   public:
+    struct Pair {
         alignas(64) S falloff[Shape::lanes], through[Shape::lanes];
     };
+    struct Place {
+        S x, y;  // the tile's first pixel centre
+        S stop;
+        int channels;
+    };
+    LaneCoordinates<S> at;
+
+    // Front to back, leaving checkpoints; returns how many entries come before those that are drawn nowhere.
+    int64_t to_the_back(const Bins<S>& bins, const int32_t* entries, int64_t count, Place place) {
+        for (auto& block : through_) P(S(1)).store(block);
+        checkpoints_.clear();
+        for (int64_t entry = 0; entry < count;) {
+            checkpoints_.emplace_back();
+            checkpoints_.back().entry = entry;
+            std::memcpy(checkpoints_.back().through, through_, sizeof through_);
+            entry = sweep(bins, entries, entry, count, place);
+            if (!live_) return entry;
+        }
+        return count;
+    }
+
+    // Calls function(entry, its blocks, their pairs) from the entry before `end` to the first.
+    template <class F>
+    void to_the_front(
+        const Bins<S>& bins, const int32_t* entries, int64_t end, Place place, F&& function) {
+        for (std::size_t k = checkpoints_.size(); k-- > 0;) {
+            const int64_t begin = checkpoints_[k].entry;
+            if (k + 1 < checkpoints_.size()) {  // the store holds the pairs of the last one
+                std::memcpy(through_, checkpoints_[k].through, sizeof through_);
+                sweep(bins, entries, begin, end, place);
+            }
+            for (; end-- > begin;) {
+                if (end >= begin + kGroup) prefetch_record(bins.record(entries[end - kGroup]), place.channels);
+                const BlockSet<S> set = sets_[end - begin];
+                held_ -= count_blocks(set);
+                function(end, set, pairs_ + held_);
+            }
+            end = begin;
+        }
+    }
+
+   private:
+    // Blocks of pairs held at a time.
+    static constexpr int kStored = 1 << 13;
     // Transmittance in front of an entry from which a later sweep starts again.
     struct Checkpoint {
         int64_t entry;
         alignas(64) S through[Shape::blocks][Shape::lanes];
     };
 
-    LaneCoordinates<S> at;
-    alignas(64) S g_image[Shape::blocks][C > 0 ? C : 1][Shape::lanes];
-    alignas(64) S behind[Shape::blocks][Shape::lanes];
-    alignas(64) S through[Shape::blocks][Shape::lanes];
-    StoredPairs pairs[kStored];
-    BlockSet<S> live;
-    int held;  // blocks of pairs
-    std::vector<BlockSet<S>> sets;  // of the entries whose pairs are held
-    std::vector<Checkpoint> checkpoints;
-
     // Front to back from entry `from`, storing the pairs, until they fill the store; returns the entry after the last.
-    int64_t sweep(
-        const Bins<S>& bins, const int32_t* entries, int64_t from, int64_t count, S tile_x, S tile_y, S stop) {
-        sets.clear();
+    int64_t sweep(const Bins<S>& bins, const int32_t* entries, int64_t from, int64_t count, Place place) {
+        sets_.clear();
         int stored = 0;
         // Without early stop all count: the gradient of an opaque splat is the difference that it makes.
-        live = kAllBlocks<S>;
+        live_ = kAllBlocks<S>;
         for (const int64_t first = from; from < count && stored + kGroup * Shape::blocks <= kStored;) {
-            if (stop > S(0) && (from - first) % kLiveEvery == 0) live = live_blocks(through, stop);
-            if (!live) break;
+            if (place.stop > S(0) && (from - first) % kLiveEvery == 0) live_ = live_blocks(through_, place.stop);
+            if (!live_) break;
             const int here = int(std::min<int64_t>(count - from, kGroup));
-            prefetch_group(bins, entries + from + kGroup, entries + count, C);
-            sets.resize(sets.size() + here);
-            BlockSet<S>* own = &sets[sets.size() - here];
-            find_blocks(bins, entries + from, here, tile_x, tile_y, own);
+            prefetch_group(bins, entries + from + kGroup, entries + count, place.channels);
+            sets_.resize(sets_.size() + here);
+            BlockSet<S>* own = &sets_[sets_.size() - here];
+            find_blocks(bins, entries + from, here, place.x, place.y, own);
             for (int i = 0; i < here; ++i) {
-                own[i] &= live;
-                const TileSplat<S> splat(bins.header(entries[from + i]), tile_x, tile_y);
+                own[i] &= live_;
+                const TileSplat<S> splat(bins.header(entries[from + i]), place.x, place.y);
                 each_block(own[i], [&](int block) {
-                    P t = P::load(through[block]);
-                    const P falloff = splat.falloff(splat.offset(at, block), t, P(stop));
-                    t.store(pairs[stored].through);
-                    falloff.store(pairs[stored].falloff);
+                    P t = P::load(through_[block]);
+                    const P falloff = splat.falloff(splat.offset(at, block), t, P(place.stop));
+                    t.store(pairs_[stored].through);
+                    falloff.store(pairs_[stored].falloff);
                     blend_step(P(splat.opacity), falloff, t);
-                    t.store(through[block]);
+                    t.store(through_[block]);
                     ++stored;
                 });
             }
             from += here;
         }
-        held = stored;
+        held_ = stored;
         return from;
     }
 
+    alignas(64) S through_[Shape::blocks][Shape::lanes];
+    Pair pairs_[kStored];
+    BlockSet<S> live_;
+    int held_;  // blocks of pairs
+    std::vector<BlockSet<S>> sets_;  // of the entries whose pairs are held
+    std::vector<Checkpoint> checkpoints_;
+};
+
+template <class S, int C>
+struct BackwardTile {
+    using P = Pack<S>;
+    using Shape = TileShape<S>;
+    using Sweeps = TileSweeps<S>;
+    static constexpr int kSums = gradient_stride(C);
+
+    alignas(64) S g_image[Shape::blocks][C > 0 ? C : 1][Shape::lanes];
+    alignas(64) S behind[Shape::blocks][Shape::lanes];
+
     // Writes the gradients of every entry of the tile.
     void blend(const Bins<S>& bins, int64_t tile, S tile_x, S tile_y, S stop, S* out) {
+        static thread_local const std::unique_ptr<Sweeps> sweeps(new Sweeps);
+        const typename Sweeps::Place place{tile_x, tile_y, stop, C};
         const int32_t* entries = bins.begin(tile);
-        int64_t count = bins.end(tile) - entries;
-        for (auto& block : through) P(S(1)).store(block);
-        checkpoints.clear();
-        for (int64_t entry = 0; entry < count;) {
-            checkpoints.emplace_back();
-            checkpoints.back().entry = entry;
-            std::memcpy(checkpoints.back().through, through, sizeof through);
-            entry = sweep(bins, entries, entry, count, tile_x, tile_y, stop);
-            if (!live) {  // splats behind are drawn nowhere
-                std::memset(out + entry * gradient_stride(C), 0, (count - entry) * gradient_stride(C) * sizeof(S));
-                count = entry;
-            }
-        }
-        int64_t end = count;
-        for (std::size_t k = checkpoints.size(); k-- > 0;) {
-            const int64_t begin = checkpoints[k].entry;
-            if (k + 1 < checkpoints.size()) {  // the store holds the pairs of the last one
-                std::memcpy(through, checkpoints[k].through, sizeof through);
-                sweep(bins, entries, begin, end, tile_x, tile_y, stop);
-            }
-            for (int64_t entry = end; entry-- > begin;) {
-                if (entry >= begin + kGroup) prefetch_record(bins.record(entries[entry - kGroup]), C);
-                const BlockSet<S> set = sets[entry - begin];
-                held -= count_blocks(set);
-                blend_splat(
-                    bins.header(entries[entry]), bins.record(entries[entry]) + kHeader, set, pairs + held, tile_x,
-                    tile_y, out + entry * gradient_stride(C));
-            }
-            end = begin;
-        }
+        const int64_t count = bins.end(tile) - entries, stride = gradient_stride(C);
+        const int64_t drawn = sweeps->to_the_back(bins, entries, count, place);
+        std::memset(out + drawn * stride, 0, (count - drawn) * stride * sizeof(S));
+        sweeps->to_the_front(
+            bins, entries, drawn, place,
+            [&](int64_t entry, BlockSet<S> set, const typename Sweeps::Pair* pairs) {
+                blend_splat(bins.record(entries[entry]), sweeps->at, set, pairs, tile_x, tile_y, out + entry * stride);
+            });
     }
 
     CATACAUSTICS_HD void blend_splat(
-        const Record<S>& record, const S* features, BlockSet<S> set, const StoredPairs* pair, S tile_x, S tile_y,
-        S* out) {
+        const S* data, const LaneCoordinates<S>& at, BlockSet<S> set, const typename Sweeps::Pair* pair, S tile_x,
+        S tile_y, S* out) {
+        const Record<S>& record = *reinterpret_cast<const Record<S>*>(data);
+        const S* features = data + kHeader;
         const TileSplat<S> splat(record, tile_x, tile_y);
         const P opacity(splat.opacity), zero(S(0));
         P feature[C > 0 ? C : 1], sums[kSums];

@@ -52,16 +52,15 @@ bool all_finite(const S* values, int64_t count) {
     return !bad;
 }
 
-// Finite, footprints >= 0 and opacities in [0, 1].
+// Finite, footprints in [0, kLargestFootprint] and opacities in [0, 1].
 template <class S>
 bool valid(const Points<S>& points, int64_t begin, int64_t end) {
     if (!all_finite(points.positions + 3 * begin, 3 * (end - begin))) return false;
     if (!all_finite(points.normals + 3 * begin, 3 * (end - begin))) return false;
-    if (!all_finite(points.footprints + begin, end - begin)) return false;
     int bad = 0;
     for (int64_t i = begin; i < end; ++i)
-        bad |= int(!(points.footprints[i] >= S(0))) | int(!(points.opacities[i] >= S(0))) |
-               int(!(points.opacities[i] <= S(1)));
+        bad |= int(!(points.footprints[i] >= S(0))) | int(!(points.footprints[i] <= S(kLargestFootprint))) |
+               int(!(points.opacities[i] >= S(0))) | int(!(points.opacities[i] <= S(1)));
     return !bad;
 }
 
@@ -118,9 +117,9 @@ template <class S>
 int64_t project(
     const Points<S>& points, const S* pose, const S* lens, const Drawn<S>& drawn, int threads,
     const ProjectTarget<S>& out) {
-    if (points.count > INT32_MAX - kChunk) return kTooLarge;
     const auto view = make_view<Pack<S>>(pose, lens);
     const int64_t chunks = (points.count + kChunk - 1) / kChunk;
+    if (points.count + chunks > INT32_MAX) return kTooLarge;
     // One item more than points: the place after the last is written to, and kept only where it counts.
     Scratch<SortItem<S>> items(points.count + chunks);
     Scratch<Packed<S>> splats(points.count + chunks);

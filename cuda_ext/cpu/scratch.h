@@ -42,9 +42,9 @@ class KeptBlocks {
         return block;
     }
     // Keeps a block, and lets go of those that have lain here longest where they are too many.
-    void give(Block block) {
+    void give(Block block) noexcept {
         std::unique_lock<std::mutex> lock(mutex_, std::try_to_lock);
-        if (!lock.owns_lock() || block.bytes > kMostKept) return std::free(block.data);
+        if (!lock.owns_lock() || block.bytes > kMostKept || !room_for_one()) return std::free(block.data);
         blocks_.push_back(block);
         kept_ += block.bytes;
         shrink(kMostKept);
@@ -55,6 +55,14 @@ class KeptBlocks {
     }
 
    private:
+    bool room_for_one() {
+        try {
+            blocks_.reserve(blocks_.size() + 1);
+        } catch (const std::bad_alloc&) {
+            return false;
+        }
+        return true;
+    }
     void shrink(std::size_t most) {
         std::size_t gone = 0;
         for (; kept_ > most; ++gone) {

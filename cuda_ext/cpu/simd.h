@@ -5,10 +5,6 @@
 
 #include "../math/common.h"
 
-#if defined(__SSE2__)
-#include <immintrin.h>
-#endif
-
 namespace catacaustics {
 
 #if defined(__AVX512F__) && defined(__AVX512VL__) && defined(__AVX512DQ__)
@@ -70,17 +66,8 @@ struct Pack {
     friend CATACAUSTICS_HD Mask operator<=(Pack a, Pack b) { return a.v <= b.v; }
     friend CATACAUSTICS_HD Pack select(Mask mask, Pack a, Pack b) { return Pack(mask ? a.v : b.v); }
 
+    // Compilers make one instruction of it; with a header of intrinsics every file would take twice as long to compile.
     friend CATACAUSTICS_HD Pack square_root(Pack a) {
-#if defined(__AVX512F__)
-        if constexpr (sizeof(Raw) == 64 && sizeof(S) == 4) return Pack(Raw(_mm512_sqrt_ps(__m512(a.v))));
-        if constexpr (sizeof(Raw) == 64 && sizeof(S) == 8) return Pack(Raw(_mm512_sqrt_pd(__m512d(a.v))));
-#endif
-#if defined(__AVX__)
-        if constexpr (sizeof(Raw) == 32 && sizeof(S) == 4) return Pack(Raw(_mm256_sqrt_ps(__m256(a.v))));
-        if constexpr (sizeof(Raw) == 32 && sizeof(S) == 8) return Pack(Raw(_mm256_sqrt_pd(__m256d(a.v))));
-#elif defined(__SSE2__)
-        if constexpr (sizeof(Raw) == 16 && sizeof(S) == 4) return Pack(Raw(_mm_sqrt_ps(__m128(a.v))));
-#endif
         for (int i = 0; i < size; ++i) a.v[i] = square_root(a.v[i]);
         return a;
     }

@@ -11,7 +11,7 @@
 #include <vector>
 
 #if defined(__SSE2__)
-#include <immintrin.h>
+#include <xmmintrin.h>
 #endif
 
 namespace catacaustics {
@@ -124,13 +124,16 @@ class Pool {
     Job* job_ = nullptr;
 };
 
-// Never destroyed: threads sleep in it until the process ends. A forked child has none of them and makes its own.
+// Never destroyed: threads sleep in it until the process ends. A forked child has none of them and makes its own;
+// without a lock, which another thread might have held as the process forked.
 Pool& pool() {
-    static std::mutex mutex;
-    static Pool* instance = nullptr;
-    std::lock_guard<std::mutex> lock(mutex);
-    if (!instance || instance->process != getpid()) instance = new Pool;
-    return *instance;
+    static std::atomic<Pool*> instance{nullptr};
+    Pool* known = instance.load();
+    if (known && known->process == getpid()) return *known;
+    Pool* const own = new Pool;
+    if (instance.compare_exchange_strong(known, own)) return *own;
+    delete own;  // another thread was first
+    return *known;
 }
 
 }  // namespace

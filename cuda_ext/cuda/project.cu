@@ -49,7 +49,7 @@ __global__ void find_visible(Points<S> points, Drawn<S> drawn, SortKey<S>* keys,
     if (i < points.count) {
         const S s = points.footprints[i], opacity = points.opacities[i];
         invalid = !(all_finite(row(points.positions, i)) && all_finite(row(points.normals, i)) && is_finite(s) &&
-                    s >= S(0) && opacity >= S(0) && opacity <= S(1));
+                    s >= S(0) && s <= S(kLargestFootprint) && opacity >= S(0) && opacity <= S(1));
         const View<S> view = make_view<S>(points.pose, points.lens);
         const ScreenSplat<S> splat = screen_splat(view, project_point(points, view, i, drawn.low_pass));
         visible = !invalid && can_touch(splat, drawn.cutoffs.reach2(opacity), drawn.frame);

@@ -5,6 +5,9 @@
 
 namespace catacaustics {
 
+// Squared radii up to here have gradients that 32 bits can hold.
+constexpr double kLargestFootprint = 1e16;
+
 // camera_from_world as three rows and a translation, and the lens in pixels.
 template <class T>
 struct View {
@@ -59,8 +62,8 @@ struct Projection {
     T j11, j12, j21, j22;
     T jj11, jj22, jj12;             // J J^T
     T facing, det_j;                // facing = n . (u, v, 1)
-    T sdet, det, s22, w, m, inv_s22;  // sdet = s det J; det, s22 of Sigma
-    T s11;
+    T sdet;                         // s det J
+    T s11, s22, inv_s22, w, m;      // of Sigma
 };
 
 template <class T>
@@ -94,11 +97,11 @@ CATACAUSTICS_HD Projection<T> project_disk(const View<T>& view, Vec3<T> position
     r.det_j = r.kx * r.ky * r.facing;
     const T s11 = s * r.jj11, s22 = s * r.jj22;
     r.sdet = s * r.det_j;
-    r.det = r.sdet * r.sdet + low_pass * (s11 + s22) + low_pass * low_pass;
     r.s11 = s11 + low_pass;
     r.s22 = s22 + low_pass;
-    r.w = r.s22 / r.det;
     r.inv_s22 = T(1) / r.s22;
+    // det Sigma / Sigma_22: the determinant itself would overflow for disks that are larger than the scene.
+    r.w = T(1) / (r.sdet * (r.sdet * r.inv_s22) + low_pass * ((s11 + r.s22) * r.inv_s22));
     r.m = s * r.jj12 * r.inv_s22;
     return r;
 }
@@ -183,11 +186,11 @@ CATACAUSTICS_HD DiskGradient<T> project_disk_backward(
     const ScreenGradient<T>& g) {
     const Vec3<T> n = r.normal;
     // Sigma.
-    const T g_det = -g.w * r.w / r.det;
-    const T g_s11 = low_pass * g_det;
-    const T g_s22 = g.w / r.det - (g.m * r.m + g.v * r.inv_s22) * r.inv_s22 + low_pass * g_det;
+    const T g_w = g.w * r.w;
+    const T g_s11 = -(g_w * (low_pass * r.w * r.inv_s22));
+    const T g_s22 = g_w * r.inv_s22 - (g.m * r.m + g.v * r.inv_s22) * r.inv_s22 + g_s11;
     const T g_s12 = g.m * r.inv_s22;
-    const T g_sdet = T(2) * r.sdet * g_det;
+    const T g_sdet = T(-2) * g_w * (r.w * (r.sdet * r.inv_s22));
     DiskGradient<T> out;
     out.footprint = r.jj11 * g_s11 + r.jj22 * g_s22 + r.jj12 * g_s12 + r.det_j * g_sdet;
     // J J^T and det J.
