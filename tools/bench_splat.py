@@ -36,6 +36,8 @@ from catacaustics.splatting import Backend, reference, splat_points
 from catacaustics.splatting.reference import Disks
 
 SIZES = {"20k": (20_000, 320, 213), "200k": (200_000, 1000, 666), "1M": (1_000_000, 1000, 666)}
+OPAQUE = (300_000, 1000, 666)
+GROWTH = (3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000, 3_000_000)
 NAMES = Disks._fields
 SECTIONS = ("speed", "cut-offs", "growth", "rounding", "gsplat")
 
@@ -184,7 +186,7 @@ def cut_offs(options: argparse.Namespace) -> list[dict]:
     results = []
     for size in [*options.sizes, "opaque"]:
         make = opaque_splats if size == "opaque" else random_splats
-        scene, camera = make(*SIZES.get(size, (300_000, 1000, 666)), options.channels)
+        scene, camera = make(*SIZES.get(size, OPAQUE), options.channels)
         rows: dict[str, list] = {name: [] for name in configs}
         for _ in range(options.runs + 1):
             for name, config in configs.items():
@@ -230,7 +232,7 @@ def working_memory(scene: Disks, camera: Camera) -> float:
 
 def growth(options: argparse.Namespace) -> list[dict]:
     results, (width, height) = [], SIZES["1M"][1:]
-    for count in (3_000, 10_000, 30_000, 100_000, 300_000, 1_000_000, 3_000_000):
+    for count in GROWTH:
         scene, camera = random_splats(count, width, height, options.channels)
         pairs = count_pairs(scene, camera, SplatConfig())
         runs = options.runs if count < 1_000_000 else min(options.runs, 3)
