@@ -12,7 +12,6 @@ count each multiplication and addition of the network once, those backward twice
 """
 
 import argparse
-import json
 import os
 import statistics
 import time
@@ -22,6 +21,7 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from catacaustics.files import write_json
 from catacaustics.kernels import find_library, host_kernel
 from catacaustics.renderer import FEATURES, NeuralRenderer
 
@@ -155,7 +155,7 @@ def main() -> None:
     print(", ".join(f"{name}: {value}" for name, value in header.items()))
     results = {"step": step(options), "image": image(options), "error": error(options)}
     if options.json:
-        options.json.write_text(json.dumps({**header, **results}))
+        write_json(options.json, {**header, **results})
 
 
 if __name__ == "__main__":

@@ -18,7 +18,6 @@ turns.
 import argparse
 import ctypes
 import importlib.util
-import json
 import math
 import statistics
 import time
@@ -31,6 +30,7 @@ from torch import Tensor
 
 from catacaustics.cameras import Camera
 from catacaustics.config import SplatConfig
+from catacaustics.files import write_json
 from catacaustics.kernels import find_library
 from catacaustics.splatting import Backend, reference, splat_points
 from catacaustics.splatting.reference import Disks
@@ -353,7 +353,7 @@ def main() -> None:
         print(f"\n{name}")
         results[name] = sections[name](options)
     if options.json:
-        options.json.write_text(json.dumps({**header, **results}))
+        write_json(options.json, {**header, **results})
 
 
 if __name__ == "__main__":

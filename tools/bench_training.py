@@ -30,6 +30,7 @@ import torch
 from catacaustics import scene as scenes
 from catacaustics.config import TrainConfig
 from catacaustics.environment import EnvironmentMap
+from catacaustics.files import write_json
 from catacaustics.kernels import find_library
 from catacaustics.reflectors.volume import build_volume
 from catacaustics.renderer import NeuralRenderer
@@ -145,7 +146,7 @@ def main() -> None:
         cells = (f"{1000 * value:13.1f} ({value / medians['native']:5.2f} x)" for value in medians.values())
         print(f"{name:<36}" + "".join(f"{cell:>22}" for cell in cells))
     if options.json:
-        options.json.write_text(json.dumps({**header, **results}))
+        write_json(options.json, {**header, **results})
 
 
 if __name__ == "__main__":
