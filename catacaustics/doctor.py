@@ -65,8 +65,8 @@ def _small_splat(backend: Literal["reference", "cpu", "cuda"], dtype: "torch.dty
     import torch
 
     from catacaustics.cameras import Camera
-    from catacaustics.config import SplatConfig
     from catacaustics.splatting import splat_points
+    from catacaustics.splatting.config import SplatConfig
     from catacaustics.splatting.reference import Disks
 
     generator = torch.Generator().manual_seed(0)

@@ -16,7 +16,6 @@ import torch
 from torch import Tensor, nn
 
 from catacaustics.cameras import Camera, Viewport, pixel_centers
-from catacaustics.config import SplatConfig
 from catacaustics.environment import EnvironmentMap
 from catacaustics.errors import UserError
 from catacaustics.files import read_tensors, write_tensors
@@ -25,6 +24,7 @@ from catacaustics.reflectors.warps import Displayed, learns_positions, painted, 
 from catacaustics.renderer import FEATURES, NeuralRenderer
 from catacaustics.shapes import Float, Int
 from catacaustics.splatting import SplatOutput, points_in_view, splat_points
+from catacaustics.splatting.config import SplatConfig
 
 FORMAT = 3
 

@@ -9,11 +9,11 @@ import torch
 from catacaustics.capture.dataset import open_capture
 from catacaustics.capture.truth import read_reflectors, read_truth, truth_path
 from catacaustics.catacaustic import caustic_errors, flow_error, sphere_caustic
-from catacaustics.config import SplatConfig
 from catacaustics.reflectors.volume import build_volume
 from catacaustics.reflectors.warps import QuadricWarp, StaticWarp
 from catacaustics.renderer import NeuralRenderer
 from catacaustics.scene import PointParameters, Scene
+from catacaustics.splatting.config import SplatConfig
 
 BALL = Path(__file__).parents[1] / "data_samples" / "ball"
 

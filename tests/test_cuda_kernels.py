@@ -1,21 +1,21 @@
 """The GPU's kernels where there is no GPU: compiled by NVIDIA's compiler, and run thread by thread on a CPU core.
 
-The parity tests of test_splatting.py and test_native.py run on the emulated kernels too (backend `emulated`).
+The tests of test_splatting.py, test_parity.py and test_hard_cases.py run on the emulated kernels too (backend
+`emulated`).
 """
 
 import re
 import shutil
+import struct
 import subprocess
 
 import pytest
 import torch
-from splatter import KERNELS, emulated_library, splat_points
-from test_native import results
-from test_splatting import front_camera, random_scene
+from splatter import DTYPES, KERNELS, emulated_library, front_camera, random_scene, results, splat_points
 
 from catacaustics import kernels
 from catacaustics.cameras import Viewport
-from catacaustics.config import SplatConfig
+from catacaustics.splatting.config import SplatConfig
 
 NVCC = shutil.which("nvcc") or shutil.which("/usr/local/cuda/bin/nvcc")
 
@@ -40,11 +40,51 @@ def crowd(dtype=torch.float32):
 DETERMINISTIC = SplatConfig(alpha_min=1e-3, deterministic=True)
 
 
-@pytest.mark.skipif(not NVCC, reason="no CUDA compiler (nvcc)")
-def test_every_kernel_compiles_for_every_generation_of_gpus_and_keeps_its_sums_in_registers(tmp_path):
+needs_nvcc = pytest.mark.skipif(not NVCC, reason="no CUDA compiler (nvcc)")
+
+
+def known_generations():
+    """Those of 80, 90, 100 and 120 that this compiler knows."""
     known = subprocess.run([NVCC, "--list-gpu-code"], capture_output=True, text=True, check=True).stdout.split()
-    archs = [arch for arch in ("80", "90", "100", "120") if f"sm_{arch}" in known]
-    assert "80" in archs
+    return [arch for arch in (80, 90, 100, 120) if f"sm_{arch}" in known]
+
+
+def machine_code(data):
+    """Generations of which a file of nvcc's holds machine code. Each of its containers is a header, in which its length
+    is, and entries: kind (2 is machine code, 1 is text for later compilers), lengths of header and body, generation."""
+    found = set()
+    for at in (match.start() for match in re.finditer(b"\x50\xed\x55\xba", data)):
+        header, length = struct.unpack_from("<HQ", data, at + 6)
+        entry, end = at + header, at + header + length
+        while entry < end:
+            kind, _, size, body = struct.unpack_from("<HHIQ", data, entry)
+            found |= {struct.unpack_from("<I", data, entry + 28)[0]} if kind == 2 else set()
+            entry += size + body
+    return found
+
+
+@needs_nvcc
+def test_compilers_from_12_8_on_know_every_generation():
+    said = subprocess.run([NVCC, "--version"], capture_output=True, text=True, check=True).stdout
+    version = tuple(map(int, re.search(r"release (\d+)\.(\d+)", said).groups()))
+    assert known_generations() == [80, 90, 100, 120] or version < (12, 8)
+
+
+@needs_nvcc
+def test_the_library_holds_code_for_every_generation_that_its_compiler_knows():
+    path = next((folder / "libcatacaustics_cuda.so" for folder in kernels._folders() if folder.is_dir()), None)
+    if path is None or not path.is_file():
+        pytest.skip("the GPU's library is not built")
+    data = path.read_bytes()
+    archs = known_generations()
+    assert machine_code(data) == set(archs)
+    said = " ".join(f"sm_{arch}" for arch in archs)  # its description, for doctor
+    assert f"{said} + PTX".encode() in data
+
+
+@needs_nvcc
+def test_every_kernel_compiles_for_every_generation_of_gpus_and_keeps_its_sums_in_registers(tmp_path):
+    archs = known_generations()
     targets = f"--generate-code=arch=compute_80,code=[{','.join(f'sm_{arch}' for arch in archs)}]"  # as in the build
     flags = [
         "--fatbin",
@@ -58,7 +98,9 @@ def test_every_kernel_compiles_for_every_generation_of_gpus_and_keeps_its_sums_i
     sources = sorted(map(str, (KERNELS / "cuda").glob("*.cu")))
     done = subprocess.run([NVCC, *flags, targets, *sources], capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr[-3000:]
-    assert len(list(tmp_path.iterdir())) == len(sources)
+    compiled = sorted(tmp_path.iterdir())
+    assert len(compiled) == len(sources)
+    assert all(machine_code(path.read_bytes()) == set(archs) for path in compiled)
     # Of the kernels in float32 that training spends its time in.
     frames = re.findall(r"Function properties for \S+(blend_\w+If\S+)\n\s*(\d+) bytes stack frame", done.stderr)
     assert len(frames) >= 6 * len(archs)
@@ -87,7 +129,7 @@ def test_a_build_that_fails_leaves_its_reason_for_doctor_and_lets_the_other_libr
     assert problem == "it could not be built: nvcc fatal : Unsupported gpu architecture"
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
+@DTYPES
 def test_no_result_depends_on_the_order_in_which_threads_and_blocks_run(emulated, monkeypatch, dtype):
     forward = results(*crowd(dtype), DETERMINISTIC, "cpu")
     monkeypatch.setenv("EMULATED_ORDER", "reversed")
@@ -137,5 +179,5 @@ def test_two_tiles_never_share_a_checkpoint():
 
 def test_a_kernel_that_fails_is_an_error_and_not_the_end_of_the_process(emulated):
     scene, camera, viewport = crowd()
-    with pytest.raises(ValueError, match=r"viewports of up to 2\^20 pixels"):
+    with pytest.raises(ValueError, match="viewports of up to a million pixels"):
         splat_points(*scene, camera, viewport._replace(width=2**21, height=1), backend="cpu")

@@ -6,10 +6,10 @@ import torch
 from test_splatting import front_camera
 
 from catacaustics.cameras import Camera, Viewport
-from catacaustics.config import SplatConfig
 from catacaustics.geometry import look_at
 from catacaustics.kernels import find_library
 from catacaustics.splatting import points_in_view
+from catacaustics.splatting.config import SplatConfig
 
 needs_native = pytest.mark.skipif(
     find_library("cpu").library is None, reason=f"no native kernels: {find_library('cpu').problem}"

@@ -51,7 +51,7 @@ sys.path.insert(0, sys.argv[1])
 from dataclasses import replace
 from math import inf, nan
 from catacaustics.cameras import Viewport
-from catacaustics.config import SplatConfig
+from catacaustics.splatting.config import SplatConfig
 from catacaustics.splatting import points_in_view, splat_points
 from test_splatting import front_camera, random_scene
 

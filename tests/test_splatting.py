@@ -1,96 +1,45 @@
 """The splatter against brute force, closed forms and finite differences."""
 
 import math
+import re
 
+import dense
 import numpy as np
 import pytest
 import torch
-from splatter import splat_points
+from splatter import (
+    NAMES,
+    WIDE,
+    front_camera,
+    moved_camera,
+    random_scene,
+    results,
+    splat_points,
+    tangential,
+    weighted_sum,
+)
 
 from catacaustics.cameras import Camera, Viewport
-from catacaustics.config import SplatConfig
-from catacaustics.geometry import look_at
+from catacaustics.splatting.config import SplatConfig
 from catacaustics.splatting.reference import tangent_basis
 
 pytestmark = pytest.mark.usefixtures("backend")
-WIDE = SplatConfig(support=8.0)
-NAMES = ("positions", "normals", "footprints", "opacities", "features")
 
 
-def front_camera(width=24, height=18, focal=30.0):
-    return Camera(width, height, focal, focal * 1.1, width / 2 + 0.3, height / 2 - 0.2, np.eye(4))
-
-
-def random_scene(n, channels=3, seed=0, dtype=torch.float64, size=0.02):
-    g = torch.Generator().manual_seed(seed)
-    positions = torch.rand(n, 3, generator=g, dtype=dtype) * torch.tensor([1.0, 0.8, 1.0]) + torch.tensor(
-        [-0.5, -0.4, 1.0]
-    )
-    normals = torch.nn.functional.normalize(torch.randn(n, 3, generator=g, dtype=dtype), dim=1)
-    footprints = size**2 * (0.5 + torch.rand(n, generator=g, dtype=dtype))
-    opacities = 0.05 + 0.9 * torch.rand(n, generator=g, dtype=dtype)
-    features = torch.rand(n, channels, generator=g, dtype=dtype)
-    return [t.to(dtype) for t in (positions, normals, footprints, opacities, features)]
-
-
-def brute_force(positions, normals, footprints, opacities, features, camera, viewport, config):
-    """Dense evaluation, pixel by point, with the textbook formulas and autograd: nothing shared with the splatter."""
-    pose = torch.tensor(camera.camera_from_world, dtype=positions.dtype)
-    p = positions @ pose[:3, :3].T + pose[:3, 3]
-    n = normals @ pose[:3, :3].T
-    x, y, z = p.unbind(1)
-    zero = torch.zeros_like(x)
-    perspective = torch.stack(
-        [
-            torch.stack([camera.fx / z, zero, -camera.fx * x / z**2], 1),
-            torch.stack([zero, camera.fy / z, -camera.fy * y / z**2], 1),
-        ],
-        1,
-    )
-    disk = torch.eye(3, dtype=p.dtype) - n[:, :, None] * n[:, None, :]
-    sigma = footprints[:, None, None] * perspective @ disk @ perspective.transpose(1, 2)
-    inverse = torch.linalg.inv(sigma + config.low_pass * torch.eye(2, dtype=p.dtype))
-    means = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], 1)
-    columns = torch.arange(viewport.x0, viewport.x0 + viewport.width) + 0.5
-    rows = torch.arange(viewport.y0, viewport.y0 + viewport.height) + 0.5
-    pixels = torch.stack(torch.meshgrid(columns, rows, indexing="xy"), -1).to(p.dtype)
-    d = pixels[:, :, None] - means
-    q = torch.einsum("hwni,nij,hwnj->hwn", d, inverse, d)
-    size = torch.tensor([camera.width, camera.height])
-    kept = ((means > -config.guard_band * size) & (means < (1 + config.guard_band) * size)).all(1) & (z > config.near)
-    alpha = torch.where((q <= config.support**2) & kept, opacities * torch.exp(-q / 2), 0)
-    order = torch.argsort(z, stable=True)
-    image, through = 0, torch.ones(pixels.shape[:2], dtype=p.dtype)
-    for i in order.tolist():
-        drawn = torch.where(through >= config.stop_transmittance, alpha[:, :, i], 0)
-        image = image + (through * drawn)[..., None] * features[i]
-        through = through * (1 - drawn)
-    return image, through
-
-
-def weighted_sum(image, transmittance):
-    g = torch.Generator().manual_seed(5)
-    weights = torch.rand(image.shape, generator=g, dtype=image.dtype) - 0.3
-    return (image * weights).sum() + (transmittance * (weights[..., 0] + 0.5)).sum()
-
-
-@pytest.mark.parametrize("stop", [0.0, 0.3])
+@pytest.mark.parametrize("cuts", [{}, {"stop_transmittance": 0.3}, {"alpha_min": 0.02}], ids=str)
 @pytest.mark.parametrize("budget", [10**9, 300])
-def test_image_and_every_gradient_agree_with_brute_force_whatever_the_memory_budget(budget, stop):
-    config = SplatConfig(support=4.0, pair_budget=budget, stop_transmittance=stop)
-    camera, viewport = front_camera(), Viewport(3, 2, 17, 13)
+@pytest.mark.parametrize("see", [front_camera, moved_camera])
+def test_image_and_every_gradient_agree_with_brute_force_whatever_the_memory_budget(budget, cuts, see):
+    config = SplatConfig(support=4.0, pair_budget=budget, **cuts)
+    camera, viewport = see(), Viewport(3, 2, 17, 13)
     scene = [t.requires_grad_() for t in random_scene(60, size=0.05)]
     out = splat_points(*scene, camera, viewport, config)
-    expected = brute_force(*scene, camera, viewport, config)
+    expected = dense.splat(*scene, camera, viewport, config)
     torch.testing.assert_close(out.image, expected[0], rtol=1e-10, atol=1e-12)
     torch.testing.assert_close(out.transmittance, expected[1], rtol=1e-10, atol=1e-12)
     got = torch.autograd.grad(weighted_sum(out.image, out.transmittance), scene)
     want = torch.autograd.grad(weighted_sum(*expected), scene)
-    # Along the normal itself the two parametrisations differ; a unit normal never moves that way.
-    n = scene[1].detach()
-    got, want = list(got), list(want)
-    for grads in (got, want):
-        grads[1] = grads[1] - (grads[1] * n).sum(1, keepdim=True) * n
+    got, want = ([*g[:1], tangential(g[1], scene[1].detach()), *g[2:]] for g in (got, want))
     for name, a, b in zip(NAMES, got, want, strict=True):
         torch.testing.assert_close(a, b, rtol=1e-8, atol=1e-10, msg=lambda m, name=name: f"{name}: {m}")
 
@@ -156,12 +105,14 @@ def test_points_at_equal_depth_keep_their_input_order():
     assert float(out.image) == 1.0
 
 
-def test_input_order_does_not_matter_where_depths_differ():
+def test_input_order_changes_neither_image_nor_gradients_where_depths_differ():
     scene = random_scene(80)
     shuffle = torch.randperm(80, generator=torch.Generator().manual_seed(1))
-    a = splat_points(*scene, front_camera())
-    b = splat_points(*(t[shuffle] for t in scene), front_camera())
-    torch.testing.assert_close(a.image, b.image, rtol=1e-13, atol=1e-14)
+    a = results(scene, front_camera())
+    b = results([t[shuffle] for t in scene], front_camera())
+    for name, value in b.items():
+        expected = a[name] if name in ("image", "transmittance") else a[name][shuffle]
+        torch.testing.assert_close(value, expected, rtol=0, atol=1e-13 * float(expected.abs().max()))
 
 
 def test_a_viewport_is_a_crop_and_may_reach_outside_the_image():
@@ -182,12 +133,10 @@ def test_a_point_beside_the_camera_does_not_cover_the_image():
 
 def test_the_camera_pose_moves_the_image_as_moving_the_points_does():
     scene = random_scene(40)
-    pose = look_at(np.array([0.3, -0.2, -0.5]), np.array([0.0, 0.0, 1.5]), np.array([0.0, -1.0, 0.1]))
-    moved = Camera(24, 18, 30.0, 33.0, 12.0, 9.0, pose)
-    rotation, translation = torch.tensor(pose[:3, :3]), torch.tensor(pose[:3, 3])
-    a = splat_points(*scene, moved)
-    fixed = Camera(24, 18, 30.0, 33.0, 12.0, 9.0, np.eye(4))
-    b = splat_points(scene[0] @ rotation.T + translation, scene[1] @ rotation.T, *scene[2:], fixed)
+    pose = torch.tensor(moved_camera().camera_from_world)
+    a = splat_points(*scene, moved_camera())
+    moved = (scene[0] @ pose[:3, :3].T + pose[:3, 3], scene[1] @ pose[:3, :3].T)
+    b = splat_points(*moved, *scene[2:], front_camera())
     torch.testing.assert_close(a.image, b.image, rtol=1e-10, atol=1e-12)
 
 
@@ -274,7 +223,9 @@ def test_cut_off_at_small_alpha_changes_the_image_by_no_more_than_what_it_drops(
 def test_a_nan_is_refused_with_the_tensors_name_and_its_place(index):
     scene = random_scene(6)
     scene[index].view(-1)[4] = float("nan")
-    with pytest.raises(ValueError, match=f"{NAMES[index]} has 1 values that are not finite, the first at"):
+    place = [1, 1] if scene[index].ndim == 2 else [4]
+    message = f"{NAMES[index]} has 1 values that are not finite, the first at {place}"
+    with pytest.raises(ValueError, match=f"^{re.escape(message)}$"):
         splat_points(*scene, front_camera())
 
 

@@ -13,7 +13,6 @@ from catacaustics import cli
 from catacaustics.cameras import interpolate_path
 from catacaustics.capture.dataset import open_capture
 from catacaustics.capture.truth import read_reflectors, read_truth, truth_path
-from catacaustics.config import SplatConfig
 from catacaustics.errors import UserError
 from catacaustics.geometry import Similarity, normalize, sphere_directions
 from catacaustics.reflectors.volume import build_volume
@@ -22,6 +21,7 @@ from catacaustics.renderer import NeuralRenderer
 from catacaustics.run import Run
 from catacaustics.scene import PointParameters, Scene
 from catacaustics.splatting import splat_points
+from catacaustics.splatting.config import SplatConfig
 from catacaustics.tracking import (
     blending_weights,
     draw_dots,

@@ -29,10 +29,10 @@ import torch
 from torch import Tensor
 
 from catacaustics.cameras import Camera
-from catacaustics.config import SplatConfig
 from catacaustics.files import write_json
 from catacaustics.kernels import find_library
 from catacaustics.splatting import Backend, reference, splat_points
+from catacaustics.splatting.config import SplatConfig
 from catacaustics.splatting.reference import Disks
 
 SIZES = {"20k": (20_000, 320, 213), "200k": (200_000, 1000, 666), "1M": (1_000_000, 1000, 666)}

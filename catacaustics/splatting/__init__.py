@@ -3,13 +3,13 @@
 from torch import Tensor
 
 from catacaustics.cameras import Camera, Viewport
-from catacaustics.config import SplatConfig
 from catacaustics.kernels import Backend, backend_for
 from catacaustics.shapes import Float
 from catacaustics.splatting import native, reference
+from catacaustics.splatting.config import SplatConfig
 from catacaustics.splatting.reference import Disks, SplatOutput, check_shapes, check_view, points_in_view
 
-__all__ = ["Backend", "SplatOutput", "backend_for", "points_in_view", "splat_points"]
+__all__ = ["Backend", "SplatConfig", "SplatOutput", "backend_for", "points_in_view", "splat_points"]
 
 
 def splat_points(

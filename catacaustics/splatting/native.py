@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from catacaustics.cameras import Camera, Viewport
-from catacaustics.config import SplatConfig
 from catacaustics.kernels import INVALID_VALUES, library_for
+from catacaustics.splatting.config import SplatConfig
 from catacaustics.splatting.reference import Disks, SplatOutput, check_values, guard_sides
 
 _RECORD = 8  # values of a record

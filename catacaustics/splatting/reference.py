@@ -31,9 +31,9 @@ import torch
 from torch import Tensor
 
 from catacaustics.cameras import Camera, Viewport
-from catacaustics.config import SplatConfig
 from catacaustics.kernels import host_kernel
 from catacaustics.shapes import Float, Int
+from catacaustics.splatting.config import SplatConfig
 
 
 class Disks(NamedTuple):
@@ -291,7 +291,7 @@ class _Blend(torch.autograd.Function):
             else:
                 pairs, before = kept
             rows, columns = _window(region, ctx.viewport)
-            g = g_image[rows, columns].reshape(-1, g_image.shape[-1])
+            g = g_image[rows, columns].reshape(region.width * region.height, g_image.shape[-1])
             g_out = g_transmittance[rows, columns].reshape(-1)
             parts = _backward_region(pairs, before, forms[index], features[index], g, g_out)
             for grad, part in zip(grads, parts, strict=True):

@@ -8,7 +8,7 @@ from torch import nn
 
 from catacaustics.cameras import up_direction
 from catacaustics.capture.dataset import Capture
-from catacaustics.config import SplatConfig, TrainConfig
+from catacaustics.config import TrainConfig
 from catacaustics.environment import EnvironmentMap
 from catacaustics.errors import UserError
 from catacaustics.reflectors.fit import fit_bowl, fit_ellipsoid, fit_plane, fit_sphere, surroundings
@@ -26,6 +26,7 @@ from catacaustics.reflectors.warps import (
 from catacaustics.renderer import FEATURES, NeuralRenderer
 from catacaustics.scene import PointParameters, Scene
 from catacaustics.shapes import Float
+from catacaustics.splatting.config import SplatConfig
 from catacaustics.training.mirrors import hull_of, start_shapes, turned_body_of
 from catacaustics.training.photographs import photograph, scaled_camera
 

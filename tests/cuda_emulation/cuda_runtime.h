@@ -1,9 +1,10 @@
 // Enough of CUDA to run the kernels of cuda_ext/cuda on one CPU core, block by block (x86-64, GCC or Clang).
 //
 // The threads of a block are fibers: each runs until it waits for its warp or its block, and goes on when all have
-// come. What a GPU leaves undefined ends the process with a message: threads that wait for others which never come, lanes of
-// a warp that wait at different places. EMULATED_ORDER=reversed runs the last thread and the last block first: results
-// that depend on it show a missing barrier.
+// come. What a GPU leaves undefined ends the process with a message: threads that wait for others which never come,
+// lanes of a warp that wait at different places. Shared memory is not-a-numbers when a block starts.
+// EMULATED_ORDER=reversed runs the last thread and the last block first: results that depend on it show a missing
+// barrier.
 #pragma once
 
 #include <cmath>
@@ -26,6 +27,9 @@ struct dim3 {
     dim3(unsigned x = 1, unsigned y = 1, unsigned z = 1) : x(x), y(y), z(z) {}
 };
 inline dim3 threadIdx, blockIdx, blockDim, gridDim;
+
+// All shared memory of the library, see shared_memory.ld.
+extern "C" __attribute__((visibility("hidden"))) char shared_memory_start[], shared_memory_end[];
 
 namespace emulation {
 
@@ -123,6 +127,8 @@ inline bool reversed() {
 inline void run_block() {
     const unsigned count = blockDim.x;
     const bool backwards = reversed();
+    if (shared_memory_start == shared_memory_end) fail("shared memory is not where it is looked for");
+    std::memset(shared_memory_start, 0xff, shared_memory_end - shared_memory_start);
     for (unsigned i = 0; i < count; ++i) start(i);
     for (;;) {
         bool ended = true;
