@@ -114,7 +114,7 @@ def test_grazing_disks_look_as_in_the_reference(backend, dtype, angle):
 
 
 @DTYPES
-@pytest.mark.parametrize("footprint", [1e-12, 1e6, 1e12, 9e15])
+@pytest.mark.parametrize("footprint", [1e-12, 1e6, 1e12, 9e14])
 def test_footprints_from_nothing_to_larger_than_the_scene(backend, dtype, footprint):
     scene = random_scene(30, dtype=dtype)
     scene[2] = torch.full_like(scene[2], footprint)

@@ -19,7 +19,7 @@ CASES = {
     "splat(opacities=opacities.double())": "opacities must be float32 or float64 like positions, got torch.float64",
     "splat(normals=normals.to('meta'))": "normals must be on cpu like positions, got meta",
     "splat(footprints=put(footprints, -2))": "footprints must be >= 0: 1 are not, the first at [3] is -2",
-    "splat(footprints=footprints + 1e17)": "footprints must be <= 1e+16: 6 are not, the first at [0] is 1e+17",
+    "splat(footprints=footprints + 1e17)": "footprints must be <= 1e+15: 6 are not, the first at [0] is 1e+17",
     "splat(opacities=put(opacities, 1.5))": "opacities must be <= 1: 1 are not, the first at [3] is 1.5",
     "splat(normals=put(normals, inf))": ("normals has 3 values that are not finite, the first at [3, 0]"),
     "splat(camera=replace(camera, fx=nan))": "camera.fx must be finite, got nan",

@@ -30,7 +30,7 @@ def splat_points(
 
     Args:
         positions, normals: world space; normals of unit length.
-        footprints: squared radii, world units squared, non-negative, at most 1e16.
+        footprints: squared radii, world units squared, non-negative, at most 1e15.
         opacities: in [0, 1].
         camera: pinhole camera in world units.
         viewport: pixels to compute; the whole image by default.

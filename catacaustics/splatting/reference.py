@@ -406,7 +406,7 @@ def _reach2(opacities: Tensor, config: SplatConfig) -> Tensor:
     return reach2
 
 
-LARGEST_FOOTPRINT = 1e16
+LARGEST_FOOTPRINT = 1e15
 """Squared radii up to here have gradients that 32 bits can hold."""
 
 
@@ -461,7 +461,7 @@ def check_values(**tensors: Tensor) -> None:
     for name, (least, most) in rules.items():
         if name not in tensors:
             continue
-        for wanted, outside in ((f">= {least}", tensors[name] < least), (f"<= {most}", tensors[name] > most)):
+        for wanted, outside in ((f">= {least}", tensors[name] < least), (f"<= {most:g}", tensors[name] > most)):
             bad = torch.nonzero(outside)
             if len(bad):
                 first = float(tensors[name][bad[0, 0]])

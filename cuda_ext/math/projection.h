@@ -6,7 +6,7 @@
 namespace catacaustics {
 
 // Squared radii up to here have gradients that 32 bits can hold.
-constexpr double kLargestFootprint = 1e16;
+constexpr double kLargestFootprint = 1e15;
 
 // camera_from_world as three rows and a translation, and the lens in pixels.
 template <class T>
