@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import torch
-from test_splatting import front_camera
+from splatter import front_camera
 
 from catacaustics.cameras import Camera, Viewport
 from catacaustics.geometry import look_at

@@ -8,17 +8,12 @@ from pathlib import Path
 
 import pytest
 import torch
-from splatter import KERNELS
-from test_splatting import front_camera, random_scene
+from splatter import KERNELS, front_camera, needs_native, random_scene
 
 from catacaustics import kernels
 from catacaustics.errors import UserError
 from catacaustics.kernels import NativeError, find_library, load_library
 from catacaustics.splatting import splat_points
-
-needs_native = pytest.mark.skipif(
-    find_library("cpu").library is None, reason=f"no native kernels: {find_library('cpu').problem}"
-)
 
 
 @pytest.fixture

@@ -53,7 +53,7 @@ from math import inf, nan
 from catacaustics.cameras import Viewport
 from catacaustics.splatting.config import SplatConfig
 from catacaustics.splatting import points_in_view, splat_points
-from test_splatting import front_camera, random_scene
+from splatter import front_camera, random_scene
 
 positions, normals, footprints, opacities, features = random_scene(6, 6, dtype=torch.float32)
 disks = dict(positions=positions, normals=normals, footprints=footprints, opacities=opacities, features=features)
