@@ -255,10 +255,10 @@ def chart(results: list[dict[str, Any]]) -> str:
             x, y, marker="o", markersize=3, linewidth=1 if faint else 2, linestyle="--" if faint else "-"
         )
         ends.append((float(y[-1]), float(x[-1]), name, line.get_color()))
-    gap, lowest = np.ptp(axes.get_ylim()) / _LINES, -np.inf
+    gap, lowest, beside = np.ptp(axes.get_ylim()) / _LINES, -np.inf, 1.01 * max((end[1] for end in ends), default=0.0)
     for y, x, name, color in sorted(ends):  # names of curves that end close together stand above each other
         lowest = max(y, lowest + gap)
-        axes.annotate(name, (x, y), (1.01 * x, lowest), va="center", fontsize=8, color=color)
+        axes.annotate(name, (x, y), (beside, lowest), va="center", fontsize=8, color=color)
     axes.set_xlabel("training seconds")
     axes.set_ylabel("PSNR inside the reflector, held-out views (dB)")
     axes.margins(x=0.22)

@@ -6,13 +6,13 @@ import sys
 from pathlib import Path
 
 import pytest
-from splatter import problem
+from splatter import needs_native, problem
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))
 
 import bench_splat
 
-pytestmark = pytest.mark.skipif(bool(problem("cpu")), reason=f"no native kernels: {problem('cpu')}")
+pytestmark = needs_native
 
 
 def test_every_section_writes_its_figures(tmp_path, monkeypatch, capsys):
@@ -33,7 +33,8 @@ def test_every_section_writes_its_figures(tmp_path, monkeypatch, capsys):
     assert 0 < fast["image_max"] <= 1.01e-4  # what early stop leaves of the light, over features of at most 1
     pairs = [row["pairs"] for row in figures["growth"]]
     assert pairs[1] / pairs[0] == pytest.approx(2, rel=0.2)
-    assert all(math.isfinite(row["memory"]) for row in figures["growth"])
+    if Path("/proc/self/clear_refs").exists():
+        assert all(math.isfinite(row["memory"]) for row in figures["growth"])
     rounding = {row["result"]: row["of_norm"] for row in figures["rounding"]}
     assert all(0 < error < 3e-5 for error in rounding.values())
     assert set(rounding) == {"image", "transmittance", *bench_splat.NAMES}

@@ -59,6 +59,8 @@ def machine_code(data):
         while entry < end:
             kind, _, size, body = struct.unpack_from("<HHIQ", data, entry)
             found |= {struct.unpack_from("<I", data, entry + 28)[0]} if kind == 2 else set()
+            if kind not in (1, 2):
+                break  # these bytes stand in the code by chance
             entry += size + body
     return found
 

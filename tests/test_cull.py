@@ -3,17 +3,13 @@
 import numpy as np
 import pytest
 import torch
-from splatter import front_camera
+from splatter import front_camera, needs_native
 
 from catacaustics.cameras import Camera, Viewport
 from catacaustics.geometry import look_at
-from catacaustics.kernels import find_library
 from catacaustics.splatting import points_in_view
 from catacaustics.splatting.config import SplatConfig
 
-needs_native = pytest.mark.skipif(
-    find_library("cpu").library is None, reason=f"no native kernels: {find_library('cpu').problem}"
-)
 BACKENDS = pytest.mark.parametrize("backend", ["reference", pytest.param("cpu", marks=needs_native)])
 NEAR = SplatConfig().near
 

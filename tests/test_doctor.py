@@ -1,6 +1,7 @@
 """The report on what is installed."""
 
 import pytest
+from splatter import needs_native
 
 from catacaustics import kernels
 from catacaustics.config import DoctorConfig
@@ -27,7 +28,7 @@ def test_doctor_tests_each_backend_of_the_splatter_or_says_why_there_is_none(rep
     assert problem in said
 
 
-@pytest.mark.skipif(find_library("cpu").library is None, reason=f"no native kernels: {find_library('cpu').problem}")
+@needs_native
 def test_doctor_notices_a_library_whose_gradients_are_wrong(report, monkeypatch):
     class Wrong(NativeLibrary):
         def call(self, name, like, *arguments, **settings):
@@ -37,6 +38,7 @@ def test_doctor_notices_a_library_whose_gradients_are_wrong(report, monkeypatch)
             return result
 
     whole = find_library("cpu").library
-    monkeypatch.setattr(kernels, "find_library", lambda _: Found(Wrong(*whole), ""))
+    found = {"cpu": Found(Wrong(*whole), ""), "cuda": Found(None, "left out")}
+    monkeypatch.setattr(kernels, "find_library", found.__getitem__)
     assert "FAILED" in (said := report()["splatter: cpu"])
     assert "the gradient of positions is off by 1.0e-03 of its largest value" in said

@@ -5,13 +5,10 @@ import math
 
 import pytest
 import torch
+from splatter import needs_native
 
 from catacaustics.environment import EnvironmentMap
-from catacaustics.kernels import find_library
 
-needs_native = pytest.mark.skipif(
-    find_library("cpu").library is None, reason=f"no native kernels: {find_library('cpu').problem}"
-)
 BACKENDS = pytest.mark.parametrize("backend", ["reference", pytest.param("cpu", marks=needs_native)])
 DTYPES = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
 

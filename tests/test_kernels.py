@@ -33,13 +33,13 @@ def test_where_there_is_a_compiler_the_libraries_are_built():
     assert not shutil.which("nvcc") or (library.path.parent / "libcatacaustics_cuda.so").is_file()
 
 
+@pytest.mark.skipif(not shutil.which("cmake"), reason="no CMake outside of the installation's own environment")
 def test_without_a_compiler_the_package_installs_as_pure_python(tmp_path):
     source = tmp_path / "source"
-    for name in ("catacaustics", "cuda_ext", "pyproject.toml", "README.md", "LICENSE"):
-        path = KERNELS.parent / name
-        copy = shutil.copytree if path.is_dir() else shutil.copy
-        source.mkdir(exist_ok=True)
-        copy(path, source / name, **({"ignore": shutil.ignore_patterns("_native", "*.pyc")} if path.is_dir() else {}))
+    for name in ("catacaustics", "cuda_ext"):
+        shutil.copytree(KERNELS.parent / name, source / name, ignore=shutil.ignore_patterns("_native", "*.pyc"))
+    for name in ("pyproject.toml", "README.md", "LICENSE"):
+        shutil.copy(KERNELS.parent / name, source)
     command = [sys.executable, "-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", str(source)]
     subprocess.run([*command, "-w", str(tmp_path)], check=True, timeout=200, env=os.environ | {"CXX": "no-compiler"})
     [wheel] = tmp_path.glob("*.whl")
@@ -64,7 +64,7 @@ def test_a_damaged_or_foreign_library_is_refused_with_a_reason(name, installed):
     path.write_bytes(contents)
     with pytest.raises(NativeError, match="is not what SHA256SUMS beside it says"):
         load_library(path)
-    if reason:  # what else is looked at: a file that somebody has built by hand has no sum
+    if reason and sys.platform == "linux":  # what else is looked at: a file that somebody has built by hand has no sum
         (installed / "SHA256SUMS").unlink()
         with pytest.raises(NativeError, match=reason):
             load_library(path)

@@ -2,14 +2,11 @@
 
 import pytest
 import torch
+from splatter import needs_native
 
-from catacaustics.kernels import find_library
 from catacaustics.training import optimizer as optimizer_module
 from catacaustics.training.optimizer import RowAdam
 
-needs_native = pytest.mark.skipif(
-    find_library("cpu").library is None, reason=f"no native kernels: {find_library('cpu').problem}"
-)
 DTYPES = pytest.mark.parametrize("dtype", [torch.float32, torch.float64], ids=["float32", "float64"])
 BACKENDS = pytest.mark.parametrize("backend", ["reference", pytest.param("cpu", marks=needs_native)])
 

@@ -2,14 +2,12 @@
 
 import pytest
 import torch
+from splatter import needs_native
 
-from catacaustics.kernels import find_library
 from catacaustics.reflectors.fermat import path_over
 from catacaustics.reflectors.warps import QuadricWarp, painted
 
-pytestmark = pytest.mark.skipif(
-    find_library("cpu").library is None, reason=f"no native kernels: {find_library('cpu').problem}"
-)
+pytestmark = needs_native
 
 CENTER = torch.tensor([0.1, 0.2, 0.3])
 EYE = torch.tensor([0.2, -2.0, 0.5])

@@ -21,7 +21,7 @@ CASES = {
     "splat(footprints=put(footprints, -2))": "footprints must be >= 0: 1 are not, the first at [3] is -2",
     "splat(footprints=footprints + 1e17)": "footprints must be <= 1e+15: 6 are not, the first at [0] is 1e+17",
     "splat(opacities=put(opacities, 1.5))": "opacities must be <= 1: 1 are not, the first at [3] is 1.5",
-    "splat(normals=put(normals, inf))": ("normals has 3 values that are not finite, the first at [3, 0]"),
+    "splat(normals=put(normals, inf))": "normals has 3 values that are not finite, the first at [3, 0]",
     "splat(camera=replace(camera, fx=nan))": "camera.fx must be finite, got nan",
     "splat(camera=replace(camera, cy=-inf))": "camera.cy must be finite, got -inf",
     "splat(camera=replace(camera, camera_from_world=bad_pose))": (
@@ -42,7 +42,7 @@ CASES = {
     ),
     "SplatConfig(support=nan)": "support must be above 0 and finite, got nan",
     "SplatConfig(low_pass=-1)": "low_pass must be at least 0 and finite, got -1",
-    "SplatConfig(stop_transmittance=1)": "stop_transmittance must be in [0, 1) and finite, got 1",
+    "SplatConfig(stop_transmittance=1)": "stop_transmittance must be in [0, 1), got 1",
 }
 
 CODE = """

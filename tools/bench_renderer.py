@@ -147,7 +147,8 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(options.threads)
     if host_kernel("network", torch.zeros(1)) is None:
-        raise SystemExit(f"no native renderer: {find_library('cpu').problem or 'CATACAUSTICS_BACKEND leaves it out'}")
+        library, problem = find_library("cpu")
+        raise SystemExit(f"no native renderer: {'CATACAUSTICS_BACKEND leaves it out' if library else problem}")
     library = find_library("cpu").library
     assert library is not None
     header = {"threads": options.threads, "width": options.width, "layers": options.layers}

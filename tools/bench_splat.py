@@ -31,8 +31,7 @@ from torch import Tensor
 from catacaustics.cameras import Camera
 from catacaustics.files import write_json
 from catacaustics.kernels import find_library
-from catacaustics.splatting import Backend, reference, splat_points
-from catacaustics.splatting.config import SplatConfig
+from catacaustics.splatting import Backend, SplatConfig, reference, splat_points
 from catacaustics.splatting.reference import Disks
 
 SIZES = {"20k": (20_000, 320, 213), "200k": (200_000, 1000, 666), "1M": (1_000_000, 1000, 666)}
@@ -273,7 +272,7 @@ def rounding(options: argparse.Namespace) -> list[dict]:
 def against_gsplat(options: argparse.Namespace) -> list[dict]:
     library, problem = find_library("cuda")
     if library is None or not importlib.util.find_spec("gsplat"):
-        print(f"not run: {problem or 'gsplat is not installed'}")
+        print(f"not run: {'gsplat is not installed' if library else problem}")
         return []
     from gsplat import rasterization  # pyright: ignore[reportMissingImports]
 

@@ -35,17 +35,17 @@ class SplatConfig:
     def __post_init__(self):
         """Raise ValueError for settings that mean nothing; for ones that are not numbers, too."""
         rules = {
-            "low_pass": (0 <= self.low_pass < math.inf, "at least 0"),
-            "support": (0 < self.support < math.inf, "above 0"),
+            "low_pass": (0 <= self.low_pass < math.inf, "at least 0 and finite"),
+            "support": (0 < self.support < math.inf, "above 0 and finite"),
             "alpha_min": (0 <= self.alpha_min < 1, "in [0, 1)"),
             "stop_transmittance": (0 <= self.stop_transmittance < 1, "in [0, 1)"),
-            "near": (0 < self.near < math.inf, "above 0"),
-            "guard_band": (0 <= self.guard_band < math.inf, "at least 0"),
-            "pair_budget": (self.pair_budget > 0, "above 0"),
+            "near": (0 < self.near < math.inf, "above 0 and finite"),
+            "guard_band": (0 <= self.guard_band < math.inf, "at least 0 and finite"),
+            "pair_budget": (0 < self.pair_budget < math.inf, "above 0 and finite"),
         }
         for name, (right, wanted) in rules.items():
             if not right:
-                raise ValueError(f"{name} must be {wanted} and finite, got {getattr(self, name)}")
+                raise ValueError(f"{name} must be {wanted}, got {getattr(self, name)}")
 
     @classmethod
     def exact(cls, **settings: Any) -> "SplatConfig":

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from catacaustics.cameras import Camera, Viewport
-from catacaustics.kernels import INVALID_VALUES, library_for
+from catacaustics.kernels import INVALID_VALUES, NativeError, library_for
 from catacaustics.splatting.config import SplatConfig
 from catacaustics.splatting.reference import Disks, SplatOutput, check_values, guard_sides
 
@@ -64,6 +64,7 @@ def splat_project(
     count, _ = library_for(means).call("project", means, n, *inputs, *window, *cuts, means, forms, visible)
     if count == INVALID_VALUES:
         check_values(positions=positions, normals=normals, footprints=footprints, opacities=opacities)
+        raise NativeError("the library refuses values that PyTorch takes: install again")
     return means[:count], forms[:count], visible[:count]
 
 
@@ -194,6 +195,7 @@ def splat_blend(
     library, window = library_for(means), (x0, y0, width, height)
     if library.call("finite", features, inputs[0], features.numel())[0] == INVALID_VALUES:
         check_values(features=features)
+        raise NativeError("the library refuses values that PyTorch takes: install again")
     sizes, outputs = (len(visible), features.shape[1]), (image, transmittance)
     library.call("blend", means, *sizes, *inputs, *window, stop_transmittance, *outputs)
     return image, transmittance

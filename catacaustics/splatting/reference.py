@@ -6,7 +6,7 @@ normal n, tangents t1, t2 and squared radius s, has the screen-space covariance
     Sigma = s J J^T + nu I,     J = P [t1 t2],     P = [[fx/z, 0, -fx x/z^2], [0, fy/z, -fy y/z^2]]
     det J = fx fy (n . X) / z^3,   det Sigma = (s det J)^2 + nu s tr(J J^T) + nu^2      (no subtraction)
 
-(divided by Sigma_22 before it is squared: disks that are larger than the scene would overflow.)
+The determinant is computed divided by Sigma_22: for disks that are larger than the scene the square would overflow.
 
 The quadratic form is kept as a sum of squares, so that it is never negative however thin the ellipse is:
 
@@ -407,7 +407,8 @@ def _reach2(opacities: Tensor, config: SplatConfig) -> Tensor:
 
 
 LARGEST_FOOTPRINT = 1e15
-"""Squared radii up to here have gradients that 32 bits can hold."""
+"""Squared radii up to here have gradients that 32 bits can hold, seen at some thousand pixels a unit; autograd squares
+1 / w on the way, which 32 bits hold up to 1e12. The same as kLargestFootprint of cuda_ext/math/projection.h."""
 
 
 def check_shapes(**arguments: object) -> None:
@@ -482,7 +483,8 @@ def points_in_view(
     Conservative: whatever its normal, a disk's variance along screen x is at most s (fx/z)^2 (1 + (x/z)^2) + nu.
 
     Raises:
-        ValueError: wrong shapes, types or devices, a camera that is not finite; the argument is named.
+        ValueError: wrong shapes, types or devices, a camera that is not finite, a viewport that is no rectangle of
+            pixels; the argument is named.
     """
     config = config or SplatConfig()
     check_shapes(positions=positions, footprints=footprints)

@@ -21,7 +21,8 @@ struct Gradients {
     S *means, *forms, *opacities, *features;
 };
 
-// Goes through the entries of a tile front to back and then back to front; compiled once for all numbers of channels.
+// Goes through the entries of a tile front to back and then back to front. The way back is compiled for every number of
+// channels, the rest once.
 template <class S>
 class TileSweeps {
     using P = Pack<S>;
@@ -122,6 +123,13 @@ class TileSweeps {
     std::vector<Checkpoint> checkpoints_;
 };
 
+// Of this thread, for all numbers of channels.
+template <class S>
+TileSweeps<S>& own_sweeps() {
+    static thread_local const std::unique_ptr<TileSweeps<S>> sweeps(new TileSweeps<S>);
+    return *sweeps;
+}
+
 template <class S, int C>
 struct BackwardTile {
     using P = Pack<S>;
@@ -134,24 +142,24 @@ struct BackwardTile {
 
     // Writes the gradients of every entry of the tile.
     void blend(const Bins<S>& bins, int64_t tile, S tile_x, S tile_y, S stop, S* out) {
-        static thread_local const std::unique_ptr<Sweeps> sweeps(new Sweeps);
+        Sweeps& sweeps = own_sweeps<S>();
         const typename Sweeps::Place place{tile_x, tile_y, stop, C};
         const int32_t* entries = bins.begin(tile);
         const int64_t count = bins.end(tile) - entries, stride = gradient_stride(C);
-        const int64_t drawn = sweeps->to_the_back(bins, entries, count, place);
+        const int64_t drawn = sweeps.to_the_back(bins, entries, count, place);
         std::memset(out + drawn * stride, 0, (count - drawn) * stride * sizeof(S));
-        sweeps->to_the_front(
+        sweeps.to_the_front(
             bins, entries, drawn, place,
             [&](int64_t entry, BlockSet<S> set, const typename Sweeps::Pair* pairs) {
-                blend_splat(bins.record(entries[entry]), sweeps->at, set, pairs, tile_x, tile_y, out + entry * stride);
+                blend_splat(
+                    bins.header(entries[entry]), bins.record(entries[entry]) + kHeader, sweeps.at, set, pairs, tile_x,
+                    tile_y, out + entry * stride);
             });
     }
 
     CATACAUSTICS_HD void blend_splat(
-        const S* data, const LaneCoordinates<S>& at, BlockSet<S> set, const typename Sweeps::Pair* pair, S tile_x,
-        S tile_y, S* out) {
-        const Record<S>& record = *reinterpret_cast<const Record<S>*>(data);
-        const S* features = data + kHeader;
+        const Record<S>& record, const S* features, const LaneCoordinates<S>& at, BlockSet<S> set,
+        const typename Sweeps::Pair* pair, S tile_x, S tile_y, S* out) {
         const TileSplat<S> splat(record, tile_x, tile_y);
         const P opacity(splat.opacity), zero(S(0));
         P feature[C > 0 ? C : 1], sums[kSums];

@@ -50,8 +50,8 @@ class KeptBlocks {
         shrink(kMostKept);
     }
     void release() {
-        std::lock_guard<std::mutex> lock(mutex_);
-        shrink(0);
+        std::unique_lock<std::mutex> lock(mutex_, std::try_to_lock);
+        if (lock.owns_lock()) shrink(0);
     }
 
    private:

@@ -5,7 +5,8 @@
 
 namespace catacaustics {
 
-// Squared radii up to here have gradients that 32 bits can hold.
+// Squared radii up to here have gradients that 32 bits can hold, seen at some thousand pixels a unit. The same as
+// LARGEST_FOOTPRINT of catacaustics/splatting/reference.py.
 constexpr double kLargestFootprint = 1e15;
 
 // camera_from_world as three rows and a translation, and the lens in pixels.
@@ -185,16 +186,16 @@ CATACAUSTICS_HD DiskGradient<T> project_disk_backward(
     const View<T>& view, Vec3<T> position, Vec3<T> normal, T s, T low_pass, const Projection<T>& r,
     const ScreenGradient<T>& g) {
     const Vec3<T> n = r.normal;
-    // Sigma.
-    const T g_w = g.w * r.w;
-    const T g_s11 = -(g_w * (low_pass * r.w * r.inv_s22));
-    const T g_s22 = g_w * r.inv_s22 - (g.m * r.m + g.v * r.inv_s22) * r.inv_s22 + g_s11;
-    const T g_s12 = g.m * r.inv_s22;
-    const T g_sdet = T(-2) * g_w * (r.w * (r.sdet * r.inv_s22));
+    // Sigma. Factors are ordered so that large ones meet small ones: else, for disks that are larger than the scene,
+    // products would be less than 32 bits hold. g_s22 is that of log Sigma_22, without its part in nu.
+    const T g_w = g.w * r.w, g_s22 = g_w - (g.m * r.m + g.v * r.inv_s22);
+    const T low = low_pass * r.inv_s22, s_inv = s * r.inv_s22, s_w = s * r.w, slope = r.sdet * r.inv_s22;
     DiskGradient<T> out;
-    out.footprint = r.jj11 * g_s11 + r.jj22 * g_s22 + r.jj12 * g_s12 + r.det_j * g_sdet;
+    out.footprint = (r.jj22 * r.inv_s22) * g_s22 + (r.jj12 * r.inv_s22) * g.m - (r.jj11 + r.jj22) * (g_w * (r.w * low)) -
+                    T(2) * (g_w * (r.w * r.det_j)) * slope;
     // J J^T and det J.
-    const T g_jj11 = T(2) * s * g_s11, g_jj22 = T(2) * s * g_s22, g_jj12 = s * g_s12, g_det_j = s * g_sdet;
+    const T g_jj11 = T(-2) * (g_w * (s_w * low)), g_jj22 = T(2) * s_inv * g_s22 + g_jj11, g_jj12 = s_inv * g.m;
+    const T g_det_j = T(-2) * (g_w * s_w) * slope;
     const T g_j11 = r.j11 * g_jj11 + r.j21 * g_jj12;
     const T g_j12 = r.j12 * g_jj11 + r.j22 * g_jj12;
     const T g_j21 = r.j21 * g_jj22 + r.j11 * g_jj12;
