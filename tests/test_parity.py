@@ -35,7 +35,7 @@ ROOM = {torch.float32: 1e-4, torch.float64: 1e-10}
 
 @DTYPES
 @settings(
-    max_examples=40,
+    max_examples=30,
     deadline=None,
     database=None,
     derandomize=True,
