@@ -57,7 +57,7 @@ def chosen(tmp_path_factory):
     root = tmp_path_factory.mktemp("selection")
     capture = make_toy_capture(root / "capture")
     config = TrainConfig(
-        capture, root / "run", iterations=5, image_size=64, environment_width=20, warp_width=16, refine_poses=False
+        capture, root / "run", iterations=10, image_size=64, environment_width=20, warp_width=16, refine_poses=False
     )
     with mock.patch.object(mirrors, "_SHAPE_STEPS", 3), mock.patch.object(mirrors, "is_turned", return_value=True):
         train(config)
